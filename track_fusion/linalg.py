@@ -1,0 +1,68 @@
+"""Leaves of linear algebra on stacks of small symmetric positive definite matrices."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def transpose(a: Array) -> Array:
+    """Swap the last two axes."""
+    return np.swapaxes(a, -1, -2)
+
+
+def symmetrise(a: Array) -> Array:
+    """Return (a + a') / 2, shape (..., n, n)."""
+    return 0.5 * (a + transpose(a))
+
+
+def outer(a: Array) -> Array:
+    """Return a a' of each vector: (..., n) -> (..., n, n)."""
+    return a[..., :, None] * a[..., None, :]
+
+
+def matvec(a: Array, x: Array) -> Array:
+    """Return A x: (..., m, n), (..., n) -> (..., m)."""
+    return np.matmul(a, x[..., None])[..., 0]
+
+
+def inverse(cov: Array) -> Array:
+    """Invert symmetric positive definite matrices, keeping them symmetric.
+
+    Raises
+    ------
+    LinAlgError    a matrix is singular
+    """
+    return symmetrise(np.linalg.inv(cov))
+
+
+def logdet(cov: Array) -> Array:
+    """Log-determinant of positive definite matrices, (..., n, n) -> (...)."""
+    diagonal = np.diagonal(np.linalg.cholesky(cov), axis1=-2, axis2=-1)
+    return np.asarray(2.0 * np.log(diagonal).sum(-1))
+
+
+def mahalanobis_squared(residual: Array, cov: Array) -> Array:
+    """Squared Mahalanobis length r' P^-1 r, (..., n), (..., n, n) -> (...)."""
+    return np.asarray((residual * np.linalg.solve(cov, residual[..., None])[..., 0]).sum(-1))
+
+
+def is_positive_definite(cov: Array) -> NDArray[np.bool_]:
+    """Tell which matrices have a Cholesky factor, (..., n, n) -> (...)."""
+    try:
+        np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError:
+        flat = cov.reshape(-1, *cov.shape[-2:])
+        good = np.fromiter((_has_cholesky(c) for c in flat), bool, len(flat))
+        return good.reshape(cov.shape[:-2])
+    return np.ones(cov.shape[:-2], bool)
+
+
+def _has_cholesky(cov: Array) -> bool:
+    try:
+        np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError:
+        return False
+    return True
