@@ -118,6 +118,8 @@ def check_tracks(tracks: SourceTracks) -> None:
     if mean.ndim < 2 or mean.shape[-2] < 1 or mean.shape[-1] < 1:
         raise ValueError(f"The 'mean' of source tracks must have shape (..., K >= 1, n >= 1). Got {mean.shape}.")
     if cov.shape != (*mean.shape, mean.shape[-1]):
-        raise ValueError(f"The 'cov' of source tracks must have shape {(*mean.shape, mean.shape[-1])}. Got {cov.shape}.")
+        raise ValueError(
+            f"The 'cov' of source tracks must have shape {(*mean.shape, mean.shape[-1])}. Got {cov.shape}."
+        )
     if not (np.isfinite(mean).all() and np.isfinite(cov).all()):
         raise ValueError("The 'mean' and 'cov' of source tracks must be finite.")

@@ -1,0 +1,27 @@
+"""Fusion rules, one a file; `RULES` lists them all by key."""
+
+from __future__ import annotations
+
+from track_fusion.params import unknown_name_error
+from track_fusion.rules import arithmetic_average, covariance_intersection, naive
+from track_fusion.rules.base import FusedTracks, Mixture, Rule, SourceTracks
+
+_MODULES = (naive, covariance_intersection, arithmetic_average)
+
+#: Every rule by its key: what `state_fusion` may be.
+RULES: dict[str, Rule] = {module.RULE.key: module.RULE for module in _MODULES}
+
+
+def get_rule(key: str) -> Rule:
+    """Return the rule of this key.
+
+    Raises
+    ------
+    ParameterError    no such rule; the nearest key is given
+    """
+    if key not in RULES:
+        raise unknown_name_error(key, RULES, "rule")
+    return RULES[key]
+
+
+__all__ = ["RULES", "FusedTracks", "Mixture", "Rule", "SourceTracks", "get_rule"]
