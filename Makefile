@@ -1,0 +1,42 @@
+# `make` alone says what there is. Needs git, make and Python 3.11 to 3.13 with venv, or a sourced ROS 2 Jazzy.
+PYTHON ?= python3
+VENV := .venv/bin/python
+STAGES ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help venv demo test bench lint clean
+
+help:
+	@echo 'track_fusion: track-to-track fusion for ROS 2 Jazzy'
+	@echo
+	@echo '  make demo    run the published scenario over ROS 2: a table, a bag and a picture in out/demo/'
+	@echo '  make test    linters, the whole suite, colcon, the oldest NumPy and SciPy, a bare environment'
+	@echo '               (some stages only: make test STAGES="lint suite")'
+	@echo '  make lint    the linters alone: ruff and mypy'
+	@echo '  make bench   measure speed and print ratios'
+	@echo '  make venv    only make or update .venv, which the others start with'
+	@echo '  make clean   remove environments, builds and results'
+	@echo
+	@echo 'The Python used is $(PYTHON); choose another with, say, make demo PYTHON=python3.12.'
+	@echo 'In a shell with ROS 2 Jazzy sourced, that ROS is used; elsewhere ROS comes as Python wheels.'
+	@echo 'On a robot: colcon build, then ros2 launch track_fusion demo.launch.py.'
+
+venv:
+	@$(PYTHON) tools/make_venv.py
+
+demo: venv
+	@.venv/bin/track-fusion demo
+
+test: venv
+	@$(VENV) tools/run_tests.py $(STAGES)
+
+lint: venv
+	@$(VENV) tools/run_tests.py lint
+
+bench: venv
+	@$(VENV) -m benchmark
+
+clean:
+	rm -rf .venv .venv-floor .venv-bare build install log out *.egg-info
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
