@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,38 @@ class MessageError(ValueError):
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(text)
         self.reason = reason
+
+
+class TrackLike(Protocol):
+    """What the writers need of a batch of tracks; TrackArrays and the library's TrackBatch have it.
+
+    Shapes as in :class:`TrackArrays`. The axes are passed beside it, since a TrackBatch keeps them in its layout.
+    """
+
+    @property
+    def frame_id(self) -> str: ...
+    @property
+    def weight(self) -> Floats: ...
+    @property
+    def mean(self) -> Floats: ...
+    @property
+    def cov(self) -> Floats: ...
+    @property
+    def time_ns(self) -> NDArray[np.int64]: ...
+    @property
+    def track_id(self) -> NDArray[np.int64]: ...
+    @property
+    def source(self) -> NDArray[np.uint32]: ...
+    @property
+    def status(self) -> NDArray[np.uint8]: ...
+    @property
+    def existence(self) -> Floats: ...
+    @property
+    def dof(self) -> Floats: ...
+    @property
+    def uuid(self) -> NDArray[np.uint8] | None: ...
+    @property
+    def phd(self) -> bool: ...
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -51,3 +85,35 @@ class DetectionArrays:
     time_ns: int
     value: Floats
     cov: Floats | None
+
+
+#: The axes that wrap at pi, radians.
+ANGLES = frozenset({"yaw", "bearing", "elevation"})
+
+
+def merged(tracks: TrackLike, axes: Sequence[str]) -> tuple[Floats, Floats]:
+    """Merge the components of each track for a message that carries one Gaussian a track.
+
+    Angular axes are averaged as deviations from the first component, so that a track which points
+    along the cut at pi is not turned around.
+
+    Parameters
+    ----------
+    tracks : TrackLike          N tracks of C components, n axes
+    axes : sequence of str      the names of the n axes
+
+    Returns
+    -------
+    mean (N, n), cov (N, n, n)     SI units; with one component these are its own, untouched
+    """
+    if tracks.mean.shape[1] == 1:
+        return tracks.mean[:, 0], tracks.cov[:, 0]
+    weight = tracks.weight / tracks.weight.sum(1, keepdims=True)
+    first = tracks.mean[:, 0]
+    away = tracks.mean - first[:, None]
+    angular = np.array([a in ANGLES for a in axes])
+    away[..., angular] = np.remainder(away[..., angular] + np.pi, 2 * np.pi) - np.pi
+    shift = np.einsum("nc,nci->ni", weight, away)
+    spread = away - shift[:, None]
+    cov = np.einsum("nc,ncij->nij", weight, tracks.cov + spread[..., :, None] * spread[..., None, :])
+    return first + shift, cov

@@ -1,0 +1,97 @@
+"""The detection table: measurements of one scan in one sensor_msgs/PointCloud2 (doc/wire-format.md)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import lru_cache
+
+from sensor_msgs.msg import PointCloud2
+
+from msg_adapters._table import (
+    PLANS,
+    Block,
+    Fields,
+    Layout,
+    Rows,
+    Signature,
+    cov_name,
+    make_layout,
+    new_cloud,
+    signature,
+    upper_pairs,
+    upper_triangle,
+)
+from msg_adapters.arrays import DetectionArrays
+from msg_adapters.header import stamp_to_ns
+
+
+def detection_table_to_msg(detections: DetectionArrays) -> PointCloud2:
+    """Write the detections of one scan as one cloud, one row a detection, with `cov_*` when they have it.
+
+    Returns
+    -------
+    PointCloud2    its `fields` are shared between messages: do not change one in place
+
+    Raises
+    ------
+    ValueError    axis names do not give distinct fields, or the shapes do not fit
+    """
+    value, cov, axes = detections.value, detections.cov, detections.axes
+    if value.ndim != 2 or value.shape[1] != len(axes) or (cov is not None and cov.shape != (*value.shape, len(axes))):
+        raise ValueError(
+            f"The 'value' must have shape (N, {len(axes)}) for {axes}, and 'cov' (N, {len(axes)}, {len(axes)}). "
+            f"Got {value.shape} and {None if cov is None else cov.shape}."
+        )
+    layout = _layout(tuple(axes), cov is not None)
+    msg, rows = new_cloud(layout, len(value), detections.time_ns, detections.frame_id)
+    rows["mean"] = value
+    if cov is not None:
+        rows["cov"] = upper_triangle(layout, cov)
+    return msg
+
+
+def detection_table_from_msg(msg: PointCloud2, axes: Sequence[str]) -> DetectionArrays:
+    """Read the named axes of every row; the other fields are ignored, so that a lidar cloud will do.
+
+    Parameters
+    ----------
+    msg : PointCloud2
+    axes : sequence of str    the m fields that are wanted, in the order in which they are wanted
+
+    Returns
+    -------
+    DetectionArrays    value (N, m); cov (N, m, m), None when the message has no `cov_*` of these axes
+
+    Raises
+    ------
+    MessageError    `missing_field` (a covariance which is given in part included), `bad_field`,
+                    `wrong_data_length`
+    """
+    plan = _plan(signature(msg), tuple(axes))
+    rows = Rows(msg)
+    value = rows.matrix(plan.value)
+    cov = None if plan.cov is None else rows.matrix(plan.cov).reshape(rows.count, len(axes), len(axes))
+    return DetectionArrays(tuple(axes), msg.header.frame_id, stamp_to_ns(msg.header.stamp), value, cov)
+
+
+@lru_cache(maxsize=PLANS)
+def _layout(axes: tuple[str, ...], with_cov: bool) -> Layout:
+    return make_layout([], axes, with_cov)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Plan:
+    """Where the wanted fields stand."""
+
+    value: Block
+    cov: Block | None
+
+
+@lru_cache(maxsize=PLANS)
+def _plan(sig: Signature, axes: tuple[str, ...]) -> _Plan:
+    fields = Fields(sig)
+    fields.require(axes, " of a detection table")
+    names = (n for a, b in upper_pairs(axes) for n in (cov_name(a, b), cov_name(b, a)))
+    some = any(n in fields for n in names)
+    return _Plan(fields.block(axes), fields.covariance(axes, " (covariance of the axes)") if some else None)

@@ -1,0 +1,297 @@
+"""nav_msgs/Odometry, one message a track: what every ROS tool reads, without the position-velocity block.
+
+Of a state the message carries x, y, z and yaw (pose, in header.frame_id) and vx, vy, vz and turn_rate
+(twist). By REP-105 and the message's definition a twist is expressed in child_frame_id, whose
+orientation is that of the pose. A track without yaw is written with the identity orientation, so that
+both frames coincide; with yaw the velocity is turned into the body frame, and turned back in reading.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from geometry_msgs.msg import Point, Pose, PoseWithCovariance, Quaternion, Twist, TwistWithCovariance, Vector3
+from nav_msgs.msg import Odometry
+
+from msg_adapters.arrays import Floats, MessageError, TrackArrays, TrackLike, merged
+from msg_adapters.header import make_header, stamp_to_ns
+
+#: Where an axis stands in the message: 0 to 5 the pose, 6 to 11 the twist.
+_SLOT = {"x": 0, "y": 1, "z": 2, "yaw": 5, "vx": 6, "vy": 7, "vz": 8, "turn_rate": 11}
+_POSE, _TWIST = slice(0, 6), slice(6, 12)
+_SIZE = 12
+#: Variance (SI units squared) of what a track does not say, such as z of a track in the plane. Zero would
+#: say "certain": robot_localization takes a zero variance for an oversight and puts 1e-6 in its place.
+UNOBSERVED_VARIANCE = 1e6
+#: How far the squared norm of a quaternion may be from 1; beyond, it is no orientation but an oversight.
+QUATERNION_TOLERANCE = 1e-2
+#: "42", "track_42", "robot_1/track_42", "track42"; but not the last digits of a hexadecimal name.
+_NUMBERED = re.compile(r"(?:.*[_/#:.\-])?[A-Za-z]*?([0-9]+)", re.ASCII | re.DOTALL)
+_MAX_ID = 2**32 - 1
+
+CrossBlock = Literal["block_diagonal", "conservative"]
+
+
+class OdometryReading(NamedTuple):
+    """What an Odometry message says of the state.
+
+    `cross_block_absent` is true when the axes come from both the pose and the twist, so that their
+    cross-covariance, which the message cannot carry, was supplied by `cross_block`.
+    """
+
+    tracks: TrackArrays
+    cross_block_absent: bool
+
+
+def odometry_to_msgs(
+    tracks: TrackLike,
+    axes: Sequence[str],
+    child_prefix: str = "",
+    unobserved_variance: float = UNOBSERVED_VARIANCE,
+) -> list[Odometry]:
+    """Write each track as a message, its mixture merged, child_frame_id = child_prefix + id.
+
+    Parameters
+    ----------
+    tracks : TrackLike             N tracks, SI units
+    axes : sequence of str         the names of the n axes; those which the message has no place for are left out
+    child_prefix : str             such as "track_"
+    unobserved_variance : float    variance of the message's axes that are not in `axes` (m^2, rad^2, ...);
+                                   their value is 0. 0 makes RViz draw flat ellipses, but reads as "certain"
+
+    Returns
+    -------
+    list of N Odometry    stamped with the time of their track
+
+    Raises
+    ------
+    ValueError    the message has a place for none of the axes
+    """
+    have = [k for k, a in enumerate(axes) if a in _SLOT]
+    if not have:
+        raise ValueError(f"The axes must include one of {', '.join(_SLOT)}. Got {tuple(axes)!r}.")
+    slots = np.array([_SLOT[axes[k]] for k in have])
+    track_mean, track_cov = merged(tracks, axes)
+    mean = np.zeros((len(track_mean), _SIZE))
+    cov = np.zeros((len(mean), _SIZE, _SIZE))
+    cov[:] = unobserved_variance * np.eye(_SIZE)
+    mean[:, slots] = track_mean[:, have]
+    cov[:, slots[:, None], slots] = track_cov[:, np.array(have)[:, None], have]
+    yaw = mean[:, _SLOT["yaw"]]
+    if "yaw" in axes:
+        mean, cov = _turned(mean, cov, _yaw_rotation(-yaw))
+    names = [f"{child_prefix}{i}" for i in tracks.track_id.tolist()]
+    stamps = tracks.time_ns.tolist()
+    return [
+        _message(tracks.frame_id, names[k], stamps[k], mean[k].tolist(), cov[k], float(yaw[k]))
+        for k in range(len(mean))
+    ]
+
+
+def odometry_from_msg(
+    msg: Odometry,
+    axes: Sequence[str],
+    cross_block: CrossBlock = "block_diagonal",
+    *,
+    cross_weight: float = 0.5,
+    child_prefix: str | None = None,
+    twist_frame: Literal["child", "parent"] = "child",
+    status: int = 1,
+) -> OdometryReading:
+    """Read one track, in the frame of the message's header.
+
+    Covariances come as they are, asymmetric ones included: the library screens them. Where the
+    orientation is not the identity, velocity and its covariance are turned from the body into the
+    parent frame.
+
+    Parameters
+    ----------
+    msg : nav_msgs/Odometry
+    axes : sequence of str    the n axes wanted, of x, y, z, yaw, vx, vy, vz, turn_rate; positions or
+                              velocities alone will do
+    cross_block : str         what stands for the covariance between pose and twist, which the message lacks:
+                              `block_diagonal`, zero (not conservative), or `conservative`, see Notes
+    cross_weight : float      w of `conservative`, between 0 and 1
+    child_prefix : str or None    the track id is the number after this prefix, or, for None, at the end of
+                              child_frame_id; a name without number gives its CRC-32. With None two names with
+                              one number ("left_1", "right_1") are one id
+    twist_frame : str         `parent` for publishers which give the twist in header.frame_id, against the
+                              definition of the message
+    status : int              status bits of the track; the message has none (1: confirmed)
+
+    Returns
+    -------
+    OdometryReading    one Gaussian track, and whether a cross block is absent
+
+    Raises
+    ------
+    MessageError    `missing_axis`, `missing_child_frame`, `bad_orientation`
+    ValueError      a parameter is out of range
+
+    Notes
+    -----
+    `conservative` bounds the joint covariance for every admissible cross block. With A the pose block,
+    B the twist block, 0 < w < 1, and any C for which J = [[A, C], [C', B]] is positive semidefinite,
+
+        D = [[A / w, 0], [0, B / (1 - w)]] >= J.
+
+    Proof. For a vector (u, v), let a = u'Au, b = v'Bv, c = u'Cv. J >= 0 gives c^2 <= a b, applied to
+    (s u, t v) for all s and t. Then (u, v)'(D - J)(u, v) = a (1/w - 1) + b (1/(1-w) - 1) - 2 c, and
+    since 1/w - 1 = (1-w)/w =: r and 1/(1-w) - 1 = 1/r, this is
+
+        a r + b / r - 2 c >= 2 sqrt(a b) - 2 |c| >= 0,
+
+    the first step being (sqrt(a r) - sqrt(b / r))^2 >= 0. It is tight: where c = sqrt(a b) and
+    a r = b / r, D - J is singular, so that for no direction can both blocks be inflated less at this w.
+    At w = 1/2 both blocks double. The twist is turned first; that changes neither A nor the claim.
+    """
+    _check_parameters(cross_block, cross_weight, twist_frame)
+    missing = [a for a in axes if a not in _SLOT]
+    if missing or not axes:
+        raise MessageError(
+            "missing_axis",
+            f"The axes of an Odometry message must be of {', '.join(_SLOT)}. Got {', '.join(missing) or 'none'}.",
+        )
+    if not msg.child_frame_id:
+        raise MessageError("missing_child_frame", "The child_frame_id must name the track. Got an empty one.")
+    mean, cov = _state(msg, needs_orientation="yaw" in axes)
+    slots = np.array([_SLOT[a] for a in axes])
+    in_twist = slots >= _TWIST.start
+    if twist_frame == "child" and in_twist.any():
+        mean, cov = _to_parent(msg, mean, cov)
+    absent = bool(in_twist.any() and not in_twist.all())
+    cov = cov[slots[:, None], slots]
+    if absent and cross_block == "conservative":
+        inflation = np.where(in_twist, 1 / (1 - cross_weight), 1 / cross_weight)
+        cov *= np.where(in_twist[:, None] == in_twist, inflation, 1.0)
+    tracks = one_track(
+        tuple(axes), msg.header.frame_id, mean[slots], cov, time_ns=stamp_to_ns(msg.header.stamp),
+        track_id=track_id_of(msg.child_frame_id, child_prefix), status=status,
+    )  # fmt: skip
+    return OdometryReading(tracks, absent)
+
+
+def track_id_of(name: str, prefix: str | None = None) -> int:
+    """Return the track id, 0 to 2^32 - 1, that a name stands for.
+
+    The number after `prefix`; with prefix None the number at the end of the name ("track_7" is 7);
+    where there is none, the CRC-32 of the name: the same on every machine and in every run.
+    """
+    if prefix is None:
+        match = _NUMBERED.fullmatch(name)
+        digits = match.group(1) if match else ""
+    else:
+        digits = name.removeprefix(prefix) if name.startswith(prefix) else ""
+    if digits.isascii() and digits.isdigit() and len(digits) <= len(str(_MAX_ID)) and int(digits) <= _MAX_ID:
+        return int(digits)
+    return zlib.crc32(name.encode())
+
+
+def one_track(
+    axes: tuple[str, ...], frame_id: str, mean: Floats, cov: Floats, *, time_ns: int, track_id: int, status: int
+) -> TrackArrays:
+    """Make the arrays of one certain Gaussian track from mean (n,) and cov (n, n)."""
+    return TrackArrays(
+        axes=axes, frame_id=frame_id, weight=np.ones((1, 1)), mean=mean[None, None], cov=cov[None, None],
+        time_ns=np.array([time_ns], np.int64), track_id=np.array([track_id], np.int64),
+        source=np.zeros(1, np.uint32), status=np.array([status], np.uint8),
+        existence=np.ones(1), dof=np.full(1, np.inf),
+    )  # fmt: skip
+
+
+def _check_parameters(cross_block: str, cross_weight: float, twist_frame: str) -> None:
+    if cross_block not in ("block_diagonal", "conservative"):
+        raise ValueError(f"The 'cross_block' must be 'block_diagonal' or 'conservative'. Got {cross_block!r}.")
+    if not 0 < cross_weight < 1:
+        raise ValueError(f"The 'cross_weight' must lie between 0 and 1, exclusively. Got {cross_weight}.")
+    if twist_frame not in ("child", "parent"):
+        raise ValueError(f"The 'twist_frame' must be 'child' or 'parent'. Got {twist_frame!r}.")
+
+
+def _message(frame: str, child: str, stamp_ns: int, mean: list[float], cov: Floats, yaw: float) -> Odometry:
+    """Build one message from a full state, the twist in the body frame."""
+    pose = Pose(
+        position=Point(x=mean[0], y=mean[1], z=mean[2]),
+        orientation=Quaternion(x=0.0, y=0.0, z=float(np.sin(yaw / 2)), w=float(np.cos(yaw / 2))),
+    )
+    twist = Twist(linear=Vector3(x=mean[6], y=mean[7], z=mean[8]), angular=Vector3(x=mean[9], y=mean[10], z=mean[11]))
+    # Contiguous copies: a reshaped view would keep the whole batch alive.
+    return Odometry(
+        header=make_header(stamp_ns, frame),
+        child_frame_id=child,
+        pose=PoseWithCovariance(pose=pose, covariance=cov[_POSE, _POSE].flatten()),
+        twist=TwistWithCovariance(twist=twist, covariance=cov[_TWIST, _TWIST].flatten()),
+    )
+
+
+def _state(msg: Odometry, needs_orientation: bool) -> tuple[Floats, Floats]:
+    """Return the full state, mean (12,) and cov (12, 12), the twist as it stands in the message."""
+    position, linear, angular = msg.pose.pose.position, msg.twist.twist.linear, msg.twist.twist.angular
+    yaw = 0.0
+    if needs_orientation:
+        x, y, z, w = unit_quaternion(msg.pose.pose.orientation)
+        yaw = float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+    mean = np.array([position.x, position.y, position.z, 0.0, 0.0, yaw,
+                     linear.x, linear.y, linear.z, angular.x, angular.y, angular.z], np.float64)  # fmt: skip
+    cov = np.zeros((_SIZE, _SIZE))
+    cov[_POSE, _POSE] = np.asarray(msg.pose.covariance).reshape(6, 6)
+    cov[_TWIST, _TWIST] = np.asarray(msg.twist.covariance).reshape(6, 6)
+    return mean, cov
+
+
+def _to_parent(msg: Odometry, mean: Floats, cov: Floats) -> tuple[Floats, Floats]:
+    """Turn the twist from the body into the parent frame; the identity leaves every bit as it is."""
+    x, y, z, w = unit_quaternion(msg.pose.pose.orientation)
+    if x == y == z == 0.0:
+        return mean, cov
+    turned_mean, turned_cov = _turned(mean[None], cov[None], rotation_matrix(x, y, z, w)[None])
+    return turned_mean[0], turned_cov[0]
+
+
+def _turned(mean: Floats, cov: Floats, rotation: Floats) -> tuple[Floats, Floats]:
+    """Apply a rotation (N, 3, 3) to linear and angular velocity and to their covariance."""
+    both = np.zeros((len(mean), _SIZE, _SIZE))
+    both[:, range(6), range(6)] = 1.0
+    both[:, 6:9, 6:9] = both[:, 9:12, 9:12] = rotation
+    return np.einsum("nij,nj->ni", both, mean), both @ cov @ both.swapaxes(-1, -2)
+
+
+def _yaw_rotation(yaw: Floats) -> Floats:
+    """Return the rotations (N, 3, 3) about z."""
+    out = np.zeros((len(yaw), 3, 3))
+    out[:, 0, 0] = out[:, 1, 1] = np.cos(yaw)
+    out[:, 1, 0] = np.sin(yaw)
+    out[:, 0, 1] = -out[:, 1, 0]
+    out[:, 2, 2] = 1.0
+    return out
+
+
+def unit_quaternion(q: Quaternion) -> tuple[float, float, float, float]:
+    """Return x, y, z, w of an orientation, scaled to norm 1.
+
+    Raises
+    ------
+    MessageError    `bad_orientation`: not a number, zero (never filled in) or far from norm 1
+    """
+    norm = float(q.x**2 + q.y**2 + q.z**2 + q.w**2)
+    if not abs(norm - 1.0) <= QUATERNION_TOLERANCE:
+        raise MessageError(
+            "bad_orientation",
+            f"The orientation must be a unit quaternion, since the twist is in its frame. Got ({q.x}, {q.y}, {q.z}, "
+            f"{q.w}) (x, y, z, w).",
+        )
+    scale = norm**-0.5
+    return q.x * scale, q.y * scale, q.z * scale, q.w * scale
+
+
+def rotation_matrix(x: float, y: float, z: float, w: float) -> Floats:
+    """Return the rotation parent_from_body (3, 3) of a unit quaternion."""
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip

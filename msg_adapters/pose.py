@@ -1,0 +1,45 @@
+"""geometry_msgs/PoseWithCovarianceStamped: a track that has a position only, such as a localisation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+
+from msg_adapters.arrays import MessageError, TrackArrays
+from msg_adapters.header import stamp_to_ns
+from msg_adapters.odometry import one_track
+
+_SLOT = {"x": 0, "y": 1, "z": 2}
+
+
+def pose_from_msg(
+    msg: PoseWithCovarianceStamped, axes: Sequence[str] = ("x", "y"), *, track_id: int = 0, status: int = 1
+) -> TrackArrays:
+    """Read one position-only track, in the frame of the header; the covariance comes as it is.
+
+    Parameters
+    ----------
+    msg : PoseWithCovarianceStamped
+    axes : sequence of str    of x, y, z
+    track_id : int            the message has none
+    status : int              status bits; the message has none (1: confirmed)
+
+    Raises
+    ------
+    MessageError    `missing_axis`: an axis other than x, y, z, or none
+    """
+    missing = [a for a in axes if a not in _SLOT]
+    if missing or not axes:
+        raise MessageError(
+            "missing_axis", f"The axes of a pose must be of {', '.join(_SLOT)}. Got {', '.join(missing) or 'none'}."
+        )
+    slots = np.array([_SLOT[a] for a in axes])
+    position = msg.pose.pose.position
+    mean = np.array([position.x, position.y, position.z], np.float64)[slots]
+    cov = np.array(msg.pose.covariance, np.float64).reshape(6, 6)[slots[:, None], slots]
+    return one_track(
+        tuple(axes), msg.header.frame_id, mean, cov,
+        time_ns=stamp_to_ns(msg.header.stamp), track_id=track_id, status=status,
+    )  # fmt: skip
