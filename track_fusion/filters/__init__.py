@@ -1,0 +1,1 @@
+"""Filters, one a file: pure predict and update over leading batch axes."""

@@ -1,0 +1,75 @@
+"""Motion models: transition matrices and process noise over a layout's named axes."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from track_fusion.linalg import Array
+from track_fusion.params import Params, param
+from track_fusion.tracks import StateLayout
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionParams(Params):
+    """Nearly constant velocity: every position axis with its velocity, disturbed by white acceleration."""
+
+    noise_form: str = param(
+        "continuous",
+        "continuous: white acceleration in continuous time, which does not depend on how often one predicts; "
+        "piecewise_constant: an acceleration held over each interval",
+        choices=("continuous", "piecewise_constant"),
+    )
+    process_noise: float = param(
+        1.0,
+        "strength of the disturbance: power spectral density in m^2/s^3 (continuous), or standard "
+        "deviation of the acceleration in m/s^2 (piecewise_constant)",
+        low=0.0,
+    )
+
+
+class NearlyConstantVelocity:
+    """Nearly constant velocity over a layout that holds each position axis with its velocity.
+
+    Axes without a partner (yaw, ...) are refused: this model says nothing of them.
+
+    References     Li 2022 (47) for piecewise_constant.
+    """
+
+    def __init__(self, layout: StateLayout, params: MotionParams) -> None:
+        names = layout.axes
+        pairs = [(names.index(a), names.index("v" + a)) for a in ("x", "y", "z") if a in names and "v" + a in names]
+        if not pairs or 2 * len(pairs) != layout.size:
+            raise ValueError(f"Nearly constant velocity needs axes like x, vx in pairs. Got {', '.join(names)}.")
+        self.layout, self.params = layout, params
+        position, velocity = np.zeros((layout.size,) * 2), np.zeros((layout.size,) * 2)
+        cross, self._drift = np.zeros((layout.size,) * 2), np.zeros((layout.size,) * 2)
+        for p, v in pairs:
+            position[p, p] = velocity[v, v] = cross[p, v] = cross[v, p] = self._drift[p, v] = 1.0
+        self._noise = np.stack([position, cross, velocity])
+        self.matrices = lru_cache(maxsize=256)(self._matrices)
+
+    def _matrices(self, dt: float) -> tuple[Array, Array]:
+        """Return F and Q, each (n, n), over dt seconds."""
+        stacked = self.batch(np.array([dt]))
+        return stacked[0][0], stacked[1][0]
+
+    def batch(self, dt: NDArray[np.float64]) -> tuple[Array, Array]:
+        """Return F and Q, each (N, n, n), over intervals dt (N,) in seconds.
+
+        Raises
+        ------
+        ValueError    an interval is negative (prediction goes forward)
+        """
+        if (dt < 0).any():
+            raise ValueError(f"The 'dt' of a prediction must be >= 0 s. Got {dt.min():g}.")
+        transition = np.eye(self.layout.size) + dt[:, None, None] * self._drift
+        strength = self.params.process_noise
+        if self.params.noise_form == "continuous":
+            terms = strength * np.stack([dt**3 / 3, dt**2 / 2, dt], -1)
+        else:
+            terms = strength**2 * np.stack([dt**4 / 4, dt**3 / 2, dt**2], -1)
+        return transition, np.tensordot(terms, self._noise, 1)
