@@ -58,7 +58,9 @@ class Counts:
         return f"{self.passed} passed, {self.failed} failed, {self.skipped} skipped"
 
 
-def run(command: Sequence[object], *, cwd: Path = ROOT, env: dict[str, str] | None = None, capture: bool = False) -> str:
+def run(
+    command: Sequence[object], *, cwd: Path = ROOT, env: dict[str, str] | None = None, capture: bool = False
+) -> str:
     """Run a command in a process group of its own; raise StageFailure unless it exits with 0."""
     words = [str(word) for word in command]
     print("$", " ".join(Path(w).name if w == str(PYTHON) else w for w in words), flush=True)
