@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +23,8 @@ from msg_adapters.header import make_header
 PLANS = 64
 #: How many missing fields an error names.
 NAMED_MISSING = 8
+#: How many of the present ones.
+NAMED_PRESENT = 40
 
 _CODES = {
     PointField.INT8: "i1", PointField.UINT8: "u1", PointField.INT16: "i2", PointField.UINT16: "u2",
@@ -92,8 +94,13 @@ class Fields:
     def __contains__(self, name: str) -> bool:
         return name in self._by_name
 
-    def __iter__(self) -> Any:
+    def __iter__(self) -> Iterator[str]:
         return iter(self._by_name)
+
+    def __str__(self) -> str:
+        """Name the first fields."""
+        names = ", ".join(itertools.islice(self, NAMED_PRESENT))
+        return names + (", ..." if len(self._by_name) > NAMED_PRESENT else "") or "no fields"
 
     def require(self, names: Iterable[str], note: str = "") -> None:
         """Raise `missing_field`, naming those of `names` (lazily read) that are absent."""
@@ -101,7 +108,7 @@ class Fields:
         if missing:
             raise MessageError(
                 "missing_field",
-                f"The cloud must have the fields {', '.join(missing)}{note}. Got {', '.join(self) or 'no fields'}.",
+                f"The cloud must have the fields {', '.join(missing)}{note}. Got {self}.",
             )
 
     def column(self, name: str, count: int = 1) -> Column:

@@ -178,8 +178,7 @@ def _plan(sig: Signature) -> _Plan:
     if not axes:
         raise MessageError(
             "missing_field",
-            "The cloud must have an axis: a field f beside a field cov_f_f, such as x and cov_x_x. "
-            f"Got {', '.join(fields)}.",
+            f"The cloud must have an axis: a field f beside a field cov_f_f, such as x and cov_x_x. Got {fields}.",
         )
     cov = fields.covariance(axes, " (covariance of the axes)")
     own = [fields.column(f) for f in ("track_id", "status", "source", "existence")]
