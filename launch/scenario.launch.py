@@ -1,0 +1,104 @@
+"""Run a published scenario: replay, one tracker a sensor, the fusion centre and the evaluator.
+
+    ros2 launch track_fusion scenario.launch.py scenario:=li2022-linear rule:=covariance_intersection
+
+All parameters come from config/<scenario>.yaml; an argument that is given overrides the file. The launch ends when the
+replay node does.
+"""
+
+from pathlib import Path
+
+import yaml
+from ament_index_python.packages import get_package_share_directory
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+PACKAGE = "track_fusion"
+FUSED = "/fusion_centre/tracks"
+# Launch arguments that override a parameter of the file: argument, node, parameter, type.
+OVERRIDES = (
+    ("rule", "fusion_centre", "state_fusion", str),
+    ("seed", "replay", "seed", int),
+    ("pace", "replay", "pace", str),
+    ("rate", "replay", "rate", float),
+)
+
+
+def generate_launch_description():
+    """Declare the arguments; which nodes there are depends on the scenario's file."""
+    unset = "empty: as the scenario's parameter file says"
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument(
+                "scenario", default_value="li2022-linear", description="Scenario, that is a file of config/ (no .yaml)"
+            ),
+            DeclareLaunchArgument(
+                "rule", default_value="", description=f"Fusion rule, one that `track-fusion rules` lists; {unset}"
+            ),
+            DeclareLaunchArgument("seed", default_value="", description=f"Seed of the random streams; {unset}"),
+            DeclareLaunchArgument(
+                "pace",
+                default_value="",
+                choices=["", "lockstep", "realtime"],
+                description=f"Each step when the last is fused, or by the clock; {unset}",
+            ),
+            DeclareLaunchArgument(
+                "rate", default_value="", description=f"Scenario seconds a second at pace realtime; {unset}"
+            ),
+            OpaqueFunction(function=scenario_nodes),
+        ]
+    )
+
+
+def scenario_nodes(context):
+    """Build the nodes that the scenario's parameter file names."""
+    parameter_file = find_parameter_file(LaunchConfiguration("scenario").perform(context))
+    names = yaml.safe_load(parameter_file.read_text())
+    sensors = sorted(name for name in names if name.startswith("sensor_"))
+    remappings = {
+        "replay": [("~/fused", FUSED)],
+        "fusion_centre": [(f"~/sources/{sensor}/tracks", f"/{sensor}/tracks") for sensor in sensors],
+        "evaluator": [("~/truth", "/replay/truth"), ("~/tracks", FUSED)],
+    }
+    for sensor in sensors:
+        remappings[sensor] = [("~/detections", f"/replay/{sensor}/detections"), ("~/feedback", FUSED)]
+    # Replay comes last: by then the others are starting already.
+    nodes = [node(context, name, parameter_file, remappings[name]) for name in (*sensors, "fusion_centre", "evaluator")]
+    over = Shutdown(reason="the replay is over")
+    return [*nodes, node(context, "replay", parameter_file, remappings["replay"], on_exit=over)]
+
+
+def node(context, name, parameter_file, remappings, **options):
+    """Build one node; its executable is its name, but for the sensors' trackers."""
+    return Node(
+        package=PACKAGE,
+        executable="sensor_tracker" if name.startswith("sensor_") else name,
+        name=name,
+        parameters=[str(parameter_file), *overrides(context, name)],
+        remappings=remappings,
+        output="screen",
+        **options,
+    )
+
+
+def overrides(context, name):
+    """Return the parameters of one node that were given as launch arguments."""
+    given = {
+        parameter: ParameterValue(LaunchConfiguration(argument), value_type=kind)
+        for argument, owner, parameter, kind in OVERRIDES
+        if owner == name and LaunchConfiguration(argument).perform(context)
+    }
+    return [given] if given else []
+
+
+def find_parameter_file(scenario):
+    """Return the path of config/<scenario>.yaml; when there is none, say which there are."""
+    folder = Path(get_package_share_directory(PACKAGE)) / "config"
+    path = folder / f"{scenario}.yaml"
+    if path.is_file():
+        return path
+    known = [other.stem for other in sorted(folder.glob("*.yaml")) if "replay" in yaml.safe_load(other.read_text())]
+    raise RuntimeError(f"There is no scenario '{scenario}'. There are: {', '.join(known)}.")
