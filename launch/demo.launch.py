@@ -1,6 +1,8 @@
 """Run the demo's scenario (Li et al., linear) in lockstep, with a rule of your choice.
 
     ros2 launch track_fusion demo.launch.py rule:=arithmetic_average
+
+The other scenarios, and more arguments: scenario.launch.py.
 """
 
 from launch import LaunchDescription

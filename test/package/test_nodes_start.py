@@ -1,0 +1,70 @@
+"""Every node of the demo starts as its launch file says, becomes active, has the topics named, and ends cleanly.
+
+`make test` runs this file a second time with TRACK_FUSION_NODE_PYTHON set to an environment that holds nothing but
+rclpy, the message packages, NumPy and SciPy.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from package import launch_stand_in
+from ros_helpers import NodeProcess, Probe
+
+ROOT = Path(__file__).resolve().parents[2]
+PYTHON = os.environ.get("TRACK_FUSION_NODE_PYTHON", sys.executable)
+NODES = ["replay", "sensor_1", "sensor_2", "fusion_centre", "evaluator"]
+SCENARIO_DEADLINE_S = 60.0  # the scenario's steps in lockstep take about one second
+
+
+def start(node: launch_stand_in.Described) -> NodeProcess:
+    """Start a node as launch would."""
+    return NodeProcess(
+        node.executable,
+        node=node.name,
+        params_file=node.parameter_files[0],
+        params=node.parameters,
+        remaps=node.remappings,
+        python=PYTHON,
+    )
+
+
+def described(name: str) -> launch_stand_in.Described:
+    """Return one node of demo.launch.py."""
+    nodes = launch_stand_in.load(ROOT / "launch" / "demo.launch.py", ROOT).nodes
+    return next(node for node in nodes if node.name == name)
+
+
+def topics_of(probe: Probe, name: str) -> set[str]:
+    """Return what a node publishes and subscribes to."""
+    published = probe.node.get_publisher_names_and_types_by_node(name, "/")
+    subscribed = probe.node.get_subscriber_names_and_types_by_node(name, "/")
+    return {topic for topic, _ in (*published, *subscribed)}
+
+
+@pytest.mark.parametrize("name", NODES)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
+def test_a_node_starts_has_its_topics_and_ends(name: str, number: int, ros_context: Any) -> None:
+    node = described(name)
+    with start(node) as process, Probe(ros_context) as probe:
+        probe.wait_for_state(f"/{name}", "active")
+        wanted = set(node.remappings.values())
+        probe.wait_for(lambda: wanted <= topics_of(probe, name), 5.0, f"{wanted} among the topics of {name}")
+        assert not {source.replace("~", f"/{name}") for source in node.remappings} & topics_of(probe, name)
+        assert process.stop(number) == 0, process.output()
+
+
+def test_the_demo_launch_runs_to_its_end(ros_domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    nodes = launch_stand_in.load(ROOT / "launch" / "demo.launch.py", ROOT).nodes
+    with ExitStack() as stack:
+        running = {node.name: stack.enter_context(start(node)) for node in nodes}
+        assert running["replay"].wait(SCENARIO_DEADLINE_S) == 0
+        for name, process in running.items():
+            assert process.stop() == 0, f"{name}: {process.output()}"
