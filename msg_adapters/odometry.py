@@ -253,11 +253,17 @@ def _to_parent(msg: Odometry, mean: Floats, cov: Floats) -> tuple[Floats, Floats
 
 
 def _turned(mean: Floats, cov: Floats, rotation: Floats) -> tuple[Floats, Floats]:
-    """Apply a rotation (N, 3, 3) to linear and angular velocity and to their covariance."""
-    both = np.zeros((len(mean), _SIZE, _SIZE))
-    both[:, range(6), range(6)] = 1.0
-    both[:, 6:9, 6:9] = both[:, 9:12, 9:12] = rotation
-    return np.einsum("nij,nj->ni", both, mean), both @ cov @ both.swapaxes(-1, -2)
+    """Apply a rotation (N, 3, 3) to linear and angular velocity and to the covariance of the twist.
+
+    Block by block, so that what is not finite in one (an unknown angular velocity) does not spoil another.
+    """
+    mean, cov = mean.copy(), cov.copy()
+    parts = (slice(6, 9), slice(9, 12))
+    for a in parts:
+        mean[:, a] = np.einsum("nij,nj->ni", rotation, mean[:, a])
+        for b in parts:
+            cov[:, a, b] = rotation @ cov[:, a, b] @ rotation.swapaxes(-1, -2)
+    return mean, cov
 
 
 def _yaw_rotation(yaw: Floats) -> Floats:

@@ -101,6 +101,17 @@ def test_a_body_twist_and_its_covariance_are_turned_into_the_parent_frame(angles
     np.testing.assert_allclose(back.cov[0, 0, :4, :4], sampled @ sampled.T, atol=1e-12)
 
 
+@pytest.mark.parametrize("angle", [0.0, 0.7])
+def test_an_unknown_that_is_not_asked_for_spoils_nothing(angle: float) -> None:
+    pose, twist = np.eye(6), np.eye(6)
+    pose[3, 3] = twist[3, 3] = twist[5, 5] = np.inf
+    back = odometry_from_msg(message(pose=pose, twist=twist, z=np.sin(angle), w=np.cos(angle)), PLANE).tracks
+    np.testing.assert_allclose(back.cov[0, 0], np.eye(4), atol=1e-12)
+    twist[2, 2] = np.nan
+    level = odometry_from_msg(message(twist=twist), ("vx", "vy")).tracks
+    np.testing.assert_array_equal(level.cov[0, 0], np.eye(2))
+
+
 def test_a_twist_in_the_parent_frame_is_left_alone() -> None:
     half = np.sqrt(0.5)
     back = odometry_from_msg(message(z=half, w=half), ("vx", "vy"), twist_frame="parent").tracks
@@ -158,6 +169,11 @@ def test_conservative_bounds_every_admissible_cross_block(weight: float, seed: i
         scale = np.sqrt(np.diag(joint))
         assert np.linalg.eigvalsh(joint / np.outer(scale, scale)).min() > -1e-9  # it is admissible
         assert np.linalg.eigvalsh((inflated - joint) / np.outer(scale, scale)).min() > -1e-9
+
+
+def test_the_weight_of_conservative_is_that_of_the_pose() -> None:
+    a, b, _ = blocks(0)
+    np.testing.assert_allclose(bound(a, b, 0.2), np.block([[5 * a, 0 * a], [0 * a, 1.25 * b]]))
 
 
 @pytest.mark.parametrize("weight", [0.5, 0.2, 0.9])

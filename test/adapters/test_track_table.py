@@ -68,14 +68,14 @@ def test_what_is_read_is_ready_for_the_library() -> None:
 
 
 def test_what_is_read_does_not_change_with_the_message() -> None:
-    tracks = make_tracks(1)
+    tracks = make_tracks(1, uuid=np.arange(16, dtype=np.uint8)[None], dof=np.array([5.0]))
     msg = track_table_to_msg(tracks, tracks.axes, STAMP)
     back = track_table_from_msg(msg)
     for i in range(len(msg.data)):
         msg.data[i] = 0xFF
     np.testing.assert_array_equal(back.mean, tracks.mean)
-    np.testing.assert_array_equal(back.weight, tracks.weight)
-    assert back.track_id.tolist() == tracks.track_id.tolist()
+    for name in ("cov", "weight", "track_id", "status", "source", "existence", "uuid", "dof"):
+        np.testing.assert_allclose(getattr(back, name), getattr(tracks, name), rtol=1e-12)
 
 
 def test_messages_pass_the_field_checks_and_are_aligned() -> None:
@@ -119,11 +119,20 @@ def test_clouds_of_other_writers(big_endian: bool, gap: int, height: int, paddin
 
 
 @pytest.mark.parametrize("big_endian", [False, True])
-def test_an_aligned_cloud_of_another_writer(big_endian: bool) -> None:
-    lead = track_columns(status=(U4, [1, 0, 0, 3]))
-    spare = ("spare", U4, [9, 9, 9, 9])
-    msg = cloud([*lead[:3], spare, *lead[3:]], big_endian=big_endian)
-    assert all(f.offset % 8 == 0 for f in msg.fields if f.datatype == F8)
+@pytest.mark.parametrize(("height", "padding"), [(1, 0), (2, 0), (2, 8), (4, 8), (2, 3)])
+@pytest.mark.parametrize(
+    ("before", "after", "doubles_at", "step"),
+    [(U4, None, 0, 0), (None, None, 4, 4), (None, U4, 4, 0), (U4, U1, 0, 1)],
+)
+def test_aligned_and_half_aligned_clouds_of_other_writers(
+    big_endian: bool, height: int, padding: int, before: int | None, after: int | None, doubles_at: int, step: int
+) -> None:
+    own = track_columns(status=(U4, [1, 0, 0, 3]))
+    columns = [*own[:3], *([("spare", before, [9] * 4)] if before else []), *own[3:]]
+    columns += [("last", after, [9] * 4)] if after else []
+    msg = cloud(columns, big_endian=big_endian, height=height, row_padding=padding)
+    assert {f.offset % 8 for f in msg.fields if f.datatype == F8} == {doubles_at}
+    assert msg.point_step % 8 == step
     check_track_columns(track_table_from_msg(msg))
 
 
@@ -243,6 +252,7 @@ def test_one_name_for_two_covariances() -> None:
         lambda m: setattr(m, "width", m.width + 1),
         lambda m: setattr(m, "height", 2),
         lambda m: setattr(m, "height", 0),
+        lambda m: (setattr(m, "height", 2), setattr(m, "row_step", m.row_step // 2)),
         lambda m: setattr(m, "row_step", 0),
         lambda m: (setattr(m, "row_step", m.row_step + 8), m.data.extend([0] * 8)),
         lambda m: setattr(m, "point_step", m.point_step - 1),
