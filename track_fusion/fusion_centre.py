@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from track_fusion.association.assignment import nearest_neighbour
+from track_fusion.chi_square import chi_square_quantile
 from track_fusion.filters.kalman import predict
 from track_fusion.linalg import Array
 from track_fusion.models.motion import NearlyConstantVelocity
@@ -87,7 +86,7 @@ class FusionCentre:
         self.rule: Rule = RULES[params.state_fusion]
         self._rule_params = self.rule.params() if rule_params is None else rule_params
         self._manager_params = manager_params or TrackManagerParams()
-        self._gamma = float(chi2.ppf(params.gate_probability, self.layout.size))
+        self._gamma = chi_square_quantile(params.gate_probability, self.layout.size)
         self._sources = sources
         self.reset()
 
@@ -120,10 +119,9 @@ class FusionCentre:
         taking_part = {k: s for k, s in sorted(self._newest.items()) if self._is_young(s, time_ns)}
         predicted = {k: predicted_to(s, time_ns, self._motion) for k, s in taking_part.items()}
         central = predicted_to(self._manager.tracks, time_ns, self._motion)
-        pool = _Pool.of(taking_part, predicted)
+        pool = _Pool.of(taking_part, predicted, central[:0])
         target, births = self._associate(central, predicted, fresh)
-        keep = target >= 0
-        pool, target = pool.select(keep), target[keep]
+        pool, target = pool.select(target >= 0), target[target >= 0]
         fused, unconverged = self._fuse(central, pool, target, births, time_ns)
         member = np.zeros((len(fused), self._sources), bool)
         member[target, pool.source] = True
@@ -220,20 +218,20 @@ class FusionCentre:
 class _Pool:
     """The predicted tracks of all sources, in source order, with their source (P,) and own stamp (P,)."""
 
-    tracks: TrackBatch | None
+    tracks: TrackBatch
     source: NDArray[np.intp]
     stamp_ns: NDArray[np.int64]
 
     @classmethod
-    def of(cls, scans: Mapping[int, TrackBatch], predicted: Mapping[int, TrackBatch]) -> _Pool:
+    def of(cls, scans: Mapping[int, TrackBatch], predicted: Mapping[int, TrackBatch], empty: TrackBatch) -> _Pool:
         if not scans:
-            return cls(None, np.zeros(0, np.intp), np.zeros(0, np.int64))
+            return cls(empty, np.zeros(0, np.intp), np.zeros(0, np.int64))
         source = np.repeat(np.fromiter(scans, np.intp), [len(s) for s in scans.values()])
         stamp = np.concatenate([s.time_ns for s in scans.values()])
         return cls(TrackBatch.concatenate(list(predicted.values())), source, stamp)
 
     def select(self, keep: Bools) -> _Pool:
-        if self.tracks is None or keep.all():
+        if keep.all():
             return self
         return _Pool(self.tracks[keep], self.source[keep], self.stamp_ns[keep])
 
@@ -248,8 +246,6 @@ class _Pool:
 
     def shared_provenance(self) -> int:
         """Count tracks whose provenance names a source other than their own."""
-        if self.tracks is None:
-            return 0
         own = np.uint32(1) << self.source.astype(np.uint32)
         return int(((self.tracks.source & ~own) > 0).sum())
 

@@ -25,7 +25,7 @@ def outer(a: Array) -> Array:
 
 def matvec(a: Array, x: Array) -> Array:
     """Return A x: (..., m, n), (..., n) -> (..., m)."""
-    return np.matmul(a, x[..., None])[..., 0]
+    return np.asarray(np.matmul(a, x[..., None])[..., 0])
 
 
 def inverse(cov: Array) -> Array:
@@ -35,7 +35,7 @@ def inverse(cov: Array) -> Array:
     ------
     LinAlgError    a matrix is singular
     """
-    return symmetrise(np.linalg.inv(cov))
+    return symmetrise(np.asarray(np.linalg.inv(cov), np.float64))
 
 
 def logdet(cov: Array) -> Array:
@@ -51,18 +51,19 @@ def mahalanobis_squared(residual: Array, cov: Array) -> Array:
 
 def is_positive_definite(cov: Array) -> NDArray[np.bool_]:
     """Tell which matrices have a Cholesky factor, (..., n, n) -> (...)."""
+    good = np.ones(cov.shape[:-2], bool)
+    flat = cov.reshape(-1, *cov.shape[-2:])
+    good.reshape(-1)[_without_factor(flat, 0)] = False
+    return good
+
+
+def _without_factor(cov: Array, start: int) -> list[int]:
+    """List the matrices, counted from `start`, that have no Cholesky factor, by halving: a few bad ones are cheap."""
     try:
         np.linalg.cholesky(cov)
     except np.linalg.LinAlgError:
-        flat = cov.reshape(-1, *cov.shape[-2:])
-        good = np.fromiter((_has_cholesky(c) for c in flat), bool, len(flat))
-        return good.reshape(cov.shape[:-2])
-    return np.ones(cov.shape[:-2], bool)
-
-
-def _has_cholesky(cov: Array) -> bool:
-    try:
-        np.linalg.cholesky(cov)
-    except np.linalg.LinAlgError:
-        return False
-    return True
+        if len(cov) == 1:
+            return [start]
+        half = len(cov) // 2
+        return _without_factor(cov[:half], start) + _without_factor(cov[half:], start + half)
+    return []

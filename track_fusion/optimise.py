@@ -18,6 +18,8 @@ COMPACT_AT = 0.5
 
 #: (w, rows) -> first and second derivative of a convex function at w, for these rows of the batch.
 Derivatives = Callable[[Array, NDArray[np.intp]], tuple[Array, Array]]
+#: w -> first and second derivative of one convex function at w.
+ScalarDerivatives = Callable[[float], tuple[float, float]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,17 +67,43 @@ def minimise_on_interval(derivatives: Derivatives, count: int) -> Solution:
         with np.errstate(divide="ignore", invalid="ignore"):
             new = w - slope / curvature
         new = np.where((new >= low) & (new <= high), new, 0.5 * (low + high))
-        done = np.abs(new - w) <= SHORT_STEP
+        done = (np.abs(new - w) <= SHORT_STEP) | (high - low <= SHORT_STEP)
         w = new
-        if done.mean() > COMPACT_AT:
+        if done.mean() > COMPACT_AT or step == MAX_NEWTON:
             weights[rows], converged[rows], iterations[rows] = w, done, step
-            rows, w, low, high = (a[~done] for a in (rows, w, low, high))
-    weights[rows], iterations[rows] = w, MAX_NEWTON
+            left = ~done
+            rows, w, low, high = rows[left], w[left], low[left], high[left]
     return Solution(weights, converged, iterations)
 
 
-#: A weight is optimal when the duality gap, a bound on the excess of the objective, is below this.
-GAP = 1e-13
+def minimise_one(derivatives: ScalarDerivatives) -> tuple[float, bool, int]:
+    """Minimise one convex function of w on [0, 1]: `minimise_on_interval` in plain numbers.
+
+    For a single function, arrays of one element would cost several times as much.
+
+    Returns
+    -------
+    w, converged, iterations
+    """
+    starts_up, ends_down = derivatives(0.0)[0] >= 0, derivatives(1.0)[0] <= 0
+    if starts_up or ends_down:
+        return (0.5 if starts_up == ends_down else 0.0 if starts_up else 1.0), True, 0
+    w, low, high = 0.5, 0.0, 1.0
+    for step in range(1, MAX_NEWTON + 1):
+        slope, curvature = derivatives(w)
+        low, high = (w if slope <= 0 else low), (w if slope >= 0 else high)
+        new = w - slope / curvature if curvature > 0 else -1.0
+        if not low <= new <= high:
+            new = 0.5 * (low + high)
+        done = abs(new - w) <= SHORT_STEP or high - low <= SHORT_STEP
+        w = new
+        if done:
+            return w, True, step
+    return w, False, MAX_NEWTON
+
+
+#: A weight is optimal when a bound on the excess of the objective, relative to its gradient, is below this.
+GAP = 1e-12
 #: Weights this small whose multiplier says that they vanish are set to zero.
 VANISHING = 1e-7
 MAX_INTERIOR = 60
@@ -96,40 +124,45 @@ def minimise_on_simplex(gradient_hessian: GradientHessian, count: int, sources: 
     -------
     Solution    weights (count, K)
 
-    Notes         Each iterate is interior, so the matrices behind the objective stay definite.
+    Notes         Each iterate is interior, so the matrices behind the objective stay definite. The
+                  objective of a convex f exceeds its minimum by at most g'w - min g, g its gradient; that is
+                  the test of convergence, or a step too short to matter where rounding hides the gap.
     """
     weights = np.full((count, sources), 1.0 / sources)
     converged = np.zeros(count, bool)
     iterations = np.zeros(count, np.intp)
     rows = np.arange(count)
-    w = weights.copy()
-    z = np.ones_like(w)
+    w, z, moved = weights.copy(), np.empty((0, sources)), np.ones(count)
     for step in range(1, MAX_INTERIOR + 1):
         if not len(rows):
             break
         gradient, hessian = gradient_hessian(w, rows)
-        gap = (w * z).sum(1)
-        # The multipliers fit when gradient - z is constant over the sources.
-        residual = gradient - z
-        residual = np.abs(residual - (w * residual).sum(1, keepdims=True)).max(1)
-        done = (gap <= GAP * np.maximum(1.0, np.abs(gradient).max(1))) & (
-            (residual * w.min(1) <= GAP) | (residual <= 1e-8)
-        )
-        weights[rows], iterations[rows] = np.where(done[:, None] & (w < VANISHING) & (w < z), 0.0, w), step
-        converged[rows] = done
-        if done.any():
-            keep = ~done
-            rows, w, z, gradient, hessian, gap = (a[keep] for a in (rows, w, z, gradient, hessian, gap))
-        w, z = _interior_step(w, z, gradient, hessian, gap)
+        excess = gradient - gradient.min(1, keepdims=True)
+        if step == 1:  # multipliers that fit the gradient and are far from zero
+            z = excess + excess.max(1, keepdims=True)
+        scale = np.maximum(1.0, np.abs(gradient).max(1))
+        gap = (w * z).sum(1) / scale
+        done = ((w * excess).sum(1) <= GAP * scale) | ((gap <= GAP) & (moved <= SHORT_STEP))
+        if done.mean() > COMPACT_AT or step == MAX_INTERIOR:
+            vanish = done[:, None] & (w < VANISHING) & (w * scale[:, None] < excess)
+            weights[rows], iterations[rows], converged[rows] = np.where(vanish, 0.0, w), step, done
+            left = ~done
+            rows, w, z, gap, scale = rows[left], w[left], z[left], gap[left], scale[left]
+            gradient, hessian = gradient[left], hessian[left]
+        if len(rows):
+            w, z, moved = _interior_step(w, z, gradient, hessian, gap, scale)
     return Solution(weights / weights.sum(1, keepdims=True), converged, iterations)
 
 
-def _interior_step(w: Array, z: Array, gradient: Array, hessian: Array, gap: Array) -> tuple[Array, Array]:
-    """Take one step of Newton's method towards the central path, staying inside."""
+def _interior_step(
+    w: Array, z: Array, gradient: Array, hessian: Array, gap: Array, scale: Array
+) -> tuple[Array, Array, Array]:
+    """Take one step of Newton's method towards the central path, staying inside.
+
+    The aim and the distance kept from the boundary shrink with the gap, so that the last steps square it.
+    """
     sources = w.shape[1]
-    if not len(w):
-        return w, z
-    centre = (0.1 * gap / sources)[:, None] / w
+    centre = (np.minimum(0.1, gap) * gap * scale / sources)[:, None] / w
     kkt = np.ones((len(w), sources + 1, sources + 1))
     kkt[:, :sources, :sources] = hessian
     diagonal = np.arange(sources)
@@ -139,11 +172,13 @@ def _interior_step(w: Array, z: Array, gradient: Array, hessian: Array, gap: Arr
     right[:, :sources] = centre - gradient
     dw = np.linalg.solve(kkt, right[..., None])[:, :sources, 0]
     dz = centre - z - z / w * dw
-    return w + _inside(w, dw) * dw, z + _inside(z, dz) * dz
+    share = 1.0 - np.clip(gap, 1e-3, 0.01)[:, None]
+    dw *= _inside(w, dw, share)
+    return w + dw, z + _inside(z, dz, share) * dz, np.abs(dw).max(1)
 
 
-def _inside(v: Array, dv: Array) -> Array:
-    """Largest share of a step, at most 1, that stops short of the boundary by a hundredth."""
+def _inside(v: Array, dv: Array, share: Array) -> Array:
+    """Largest part of a step, at most all of it, that goes only this share of the way to the boundary."""
     with np.errstate(divide="ignore", invalid="ignore"):
         reach = np.where(dv < 0, -v / dv, np.inf).min(1, keepdims=True)
-    return np.minimum(1.0, 0.99 * reach)
+    return np.asarray(np.minimum(1.0, share * reach))

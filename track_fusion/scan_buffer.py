@@ -101,7 +101,7 @@ class ScanBuffer:
         return None
 
     def pop(self, now_ns: int) -> tuple[int, dict[int, TrackBatch], Counter[str]] | None:
-        """Return the next step that may run, or None: its time, its new scans by source, and counts of superseded scans."""
+        """Return the next step that may run, or None: time, new scans by source, counts of superseded ones."""
         stamps = [s.waiting[0] for s in self._sources if s.waiting]
         if not stamps:
             return None

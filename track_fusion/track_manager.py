@@ -88,7 +88,7 @@ class TrackManager:
         was_confirmed = np.concatenate([self.tracks.is_confirmed, np.zeros(new, bool)])
         confirmed = was_confirmed | self._confirm()
         status = confirmed * np.uint8(CONFIRMED) + ~member.any(1) * np.uint8(COASTED)
-        dead = self._expired(fused.time_ns)
+        dead = self._expired(fused.time_ns) & ~member.any(1)
         self.tracks = fused.replace(track_id=ids, status=status)
         changes = Changes(ids[old:], ids[confirmed & ~was_confirmed & ~dead], ids[dead])
         if dead.any():
@@ -106,13 +106,14 @@ class TrackManager:
 
     def _confirm(self) -> Bools:
         needed, last = self._params.confirmation_threshold
-        return (_ones(self._history & _mask(np.int64(last))) >= needed).any(1)
+        return np.asarray((_ones(self._history & _mask(np.int64(last))) >= needed).any(1))
 
     def _expired(self, time_ns: NDArray[np.int64]) -> Bools:
         limit, last = self._params.deletion_threshold
         missed = _ones(~self._history & _mask(np.minimum(self._updates, last))) >= limit
-        worn_out = (missed | ~self._hit_ever).all(1)
-        return worn_out | (time_ns - self._supported_ns > self._params.max_coast_s * 1e9)
+        worn_out = np.all(missed | ~self._hit_ever, axis=1)
+        overdue = time_ns - self._supported_ns > round(self._params.max_coast_s * 1e9)
+        return np.asarray(worn_out | overdue)
 
     def _keep(self, rows: Bools) -> None:
         self.tracks = self.tracks[rows]
@@ -128,4 +129,4 @@ def _mask(bits: NDArray[np.int64] | np.int64) -> NDArray[np.uint32]:
 def _ones(bits: NDArray[np.uint32]) -> NDArray[np.int64]:
     """Count set bits."""
     octets = np.ascontiguousarray(bits).view(np.uint8).reshape(*bits.shape, 4)
-    return np.unpackbits(octets, axis=-1).sum(-1, dtype=np.int64)
+    return np.asarray(np.unpackbits(octets, axis=-1).sum(-1, dtype=np.int64))

@@ -283,7 +283,7 @@ def _coerce(batch: TrackBatch) -> None:
     n, c, size = batch.mean.shape
     if size != batch.layout.size:
         raise ValueError(f"The 'mean' must have {batch.layout.size} axes, {batch.layout.axes}. Got {size}.")
-    shapes = {name: (n,) for name in _ROW_FIELDS} | {"weight": (n, c), "mean": (n, c, size), "cov": (n, c, size, size)}
+    shapes = dict.fromkeys(_ROW_FIELDS, (n,)) | {"weight": (n, c), "mean": (n, c, size), "cov": (n, c, size, size)}
     for name, shape in shapes.items():
         if getattr(batch, name).shape != shape:
             raise ValueError(f"The '{name}' of a batch must have shape {shape}. Got {getattr(batch, name).shape}.")

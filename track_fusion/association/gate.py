@@ -84,9 +84,9 @@ def _near(
     rows = _bins(row_cov, position)
     cols = _bins(col_cov, position)
     found: list[tuple[Indices, Indices]] = []
-    trees = {k: cKDTree(col_mean[np.ix_(at, position)]) for k, at in cols.items()}
+    trees = {k: cKDTree(col_mean[at][:, position]) for k, at in cols.items()}
     for i, at in rows.items():
-        tree = cKDTree(row_mean[np.ix_(at, position)])
+        tree = cKDTree(row_mean[at][:, position])
         for j, other in trees.items():
             reach = np.sqrt(gamma * (4.0 ** (i + 1) + 4.0 ** (j + 1))) * (1.0 + 1e-9)
             pairs = tree.sparse_distance_matrix(other, reach, output_type="ndarray")

@@ -31,7 +31,20 @@ def weighted_product(mean: Array, cov: Array, weights: Array) -> tuple[Array, Ar
     fused = inverse(info.sum(-3))
     origin = mean[..., 0, :]
     pull = matvec(info, (mean - origin[..., None, :]) / scale[..., None, :]).sum(-2)
-    return origin + scale * matvec(fused, pull), symmetrise(fused * unit)
+    fused_mean, fused_cov = origin + scale * matvec(fused, pull), symmetrise(fused * unit)
+    keep_sole(fused_mean, fused_cov, mean, cov, weights)
+    return fused_mean, fused_cov
+
+
+def keep_sole(fused_mean: Array, fused_cov: Array, mean: Array, cov: Array, weights: Array) -> None:
+    """Where one track has weight 1 and all others 0, put that track itself in place of the computed result.
+
+    Shapes (..., n), (..., n, n), (..., K, n), (..., K, n, n), (..., K).
+    """
+    sole = (weights == 1.0) & (weights.sum(-1, keepdims=True) == 1.0)
+    if sole.any():
+        *batch, _ = at = np.nonzero(sole)
+        fused_mean[tuple(batch)], fused_cov[tuple(batch)] = mean[at], cov[at]
 
 
 def merge(mean: Array, cov: Array, weights: Array) -> tuple[Array, Array]:
@@ -51,7 +64,9 @@ def merge(mean: Array, cov: Array, weights: Array) -> tuple[Array, Array]:
     offset = mean - origin[..., None, :]
     shift = (weights[..., None] * offset).sum(-2)
     spread = cov + outer(offset - shift[..., None, :])
-    return origin + shift, symmetrise((weights[..., None, None] * spread).sum(-3))
+    merged_mean, merged_cov = origin + shift, symmetrise((weights[..., None, None] * spread).sum(-3))
+    keep_sole(merged_mean, merged_cov, mean, cov, weights)
+    return merged_mean, merged_cov
 
 
 def kl_divergence(mean: Array, cov: Array, other_mean: Array, other_cov: Array) -> Array:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
+from scipy.linalg import lapack
 
 from track_fusion.linalg import Array, matvec, symmetrise, transpose
 
@@ -68,4 +70,42 @@ SHARP = 1e-8
 def _measured(inverse: Array, cov: Array) -> Array:
     """Diagonal of T^-1 P T^-T by itself, (n, B), positive."""
     diagonal = np.einsum("bij,bjk,bik->ib", inverse, cov, inverse, optimize=True)
-    return np.maximum(diagonal, np.finfo(float).tiny)
+    return np.asarray(np.maximum(diagonal, np.finfo(float).tiny))
+
+
+@dataclasses.dataclass(frozen=True)
+class SinglePair:
+    """A `Pair` of one, its diagonals as plain numbers: a few calls to LAPACK instead of dozens to NumPy.
+
+    Attributes
+    ----------
+    basis : (n, n)                           T
+    inverse : (n, n)                         T^-1
+    first, second : tuple of float (n,)      first + second = 1
+    """
+
+    basis: Array
+    inverse: Array
+    first: tuple[float, ...]
+    second: tuple[float, ...]
+
+    @classmethod
+    def of(cls, p1: Array, p2: Array) -> SinglePair | None:
+        """Diagonalise the pair p1, p2, each (n, n), positive definite; None where an axis is very sharp.
+
+        Raises
+        ------
+        LinAlgError    P1 + P2 is not positive definite
+        """
+        total = p1 + p2
+        shares, vectors, failed = lapack.dsygv(p1, total)
+        if failed:
+            raise np.linalg.LinAlgError("P1 + P2 of a pair of covariances is not positive definite")
+        first = tuple(shares.tolist())
+        if first[0] < SHARP or first[-1] > 1.0 - SHARP:
+            return None
+        return cls(total @ vectors, vectors.T, first, tuple((1.0 - shares).tolist()))
+
+    def rebuild(self, diagonal: Sequence[float]) -> Array:
+        """Return T diag(d) T'."""
+        return symmetrise((self.basis * np.array(diagonal)) @ self.basis.T)

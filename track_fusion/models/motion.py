@@ -44,7 +44,7 @@ class NearlyConstantVelocity:
         pairs = [(names.index(a), names.index("v" + a)) for a in ("x", "y", "z") if a in names and "v" + a in names]
         if not pairs or 2 * len(pairs) != layout.size:
             raise ValueError(f"Nearly constant velocity needs axes like x, vx in pairs. Got {', '.join(names)}.")
-        self.layout, self.params = layout, params
+        self.layout, self.params, self._pairs = layout, params, pairs
         position, velocity = np.zeros((layout.size,) * 2), np.zeros((layout.size,) * 2)
         cross, self._drift = np.zeros((layout.size,) * 2), np.zeros((layout.size,) * 2)
         for p, v in pairs:
@@ -73,3 +73,18 @@ class NearlyConstantVelocity:
         else:
             terms = strength**2 * np.stack([dt**4 / 4, dt**3 / 2, dt**2], -1)
         return transition, np.tensordot(terms, self._noise, 1)
+
+    def noise_factor(self, dt: float) -> Array:
+        """Return G, (n, r), with G G' = Q over dt seconds and r draws an interval: what a simulation needs."""
+        noise = self.matrices(dt)[1]
+        columns = []
+        for p, v in self._pairs:
+            # The lower Cholesky factor of a 2 x 2 block; the held acceleration leaves it one column.
+            first = np.zeros(self.layout.size)
+            first[[p, v]] = np.sqrt(noise[p, p]), noise[p, v] / np.sqrt(noise[p, p]) if noise[p, p] > 0 else 0.0
+            columns.append(first)
+            if self.params.noise_form == "continuous":
+                second = np.zeros(self.layout.size)
+                second[v] = np.sqrt(noise[v, v] - first[v] ** 2)
+                columns.append(second)
+        return np.stack(columns, 1)

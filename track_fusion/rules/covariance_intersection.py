@@ -7,15 +7,24 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.gaussian import weighted_product
-from track_fusion.densities.pair import SHARP, Pair
-from track_fusion.linalg import Array, inverse, outer, symmetrise, transpose
-from track_fusion.optimise import Derivatives, Solution, minimise_on_interval, minimise_on_simplex
+from track_fusion.densities.gaussian import keep_sole, weighted_product
+from track_fusion.densities.pair import SHARP, Pair, SinglePair
+from track_fusion.linalg import Array, inverse, matvec, outer, symmetrise, transpose
+from track_fusion.optimise import (
+    Derivatives,
+    ScalarDerivatives,
+    Solution,
+    minimise_on_interval,
+    minimise_on_simplex,
+    minimise_one,
+)
 from track_fusion.params import Params, param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
 
-#: Pairs are worked on in pieces whose arrays stay in the cache.
-CHUNK = 1024
+#: Large batches are worked on in pieces whose arrays stay in the cache.
+PAIR_CHUNK, MANY_CHUNK = 1024, 256
+#: Up to so many pairs, plain numbers are faster than arrays.
+FEW = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,16 +89,18 @@ Fusion = tuple[Array, Array, Solution]
 
 def _optimal(mean: Array, cov: Array, criterion: str) -> Fusion:
     """Fuse a flat batch, mean (B, K, n), at the weights that minimise the criterion."""
-    kernel = _fuse_pairs if mean.shape[1] == 2 else _fuse_many
-    if len(mean) <= CHUNK:
+    kernel, size = (_fuse_pairs, PAIR_CHUNK) if mean.shape[1] == 2 else (_fuse_many, MANY_CHUNK)
+    if len(mean) <= size:
         return kernel(mean, cov, criterion)
-    parts = [kernel(mean[i : i + CHUNK], cov[i : i + CHUNK], criterion) for i in range(0, len(mean), CHUNK)]
+    parts = [kernel(mean[i : i + size], cov[i : i + size], criterion) for i in range(0, len(mean), size)]
     means, covs, found = zip(*parts, strict=True)
     return np.concatenate(means), np.concatenate(covs), Solution.concatenate(found)
 
 
 def _fuse_pairs(mean: Array, cov: Array, criterion: str) -> Fusion:
     """Fuse pairs where both covariances are diagonal: one weight, Newton over the whole batch."""
+    if 0 < len(mean) <= FEW:
+        return _fuse_few(mean, cov, criterion)
     first_mean, second_mean, first, second = mean[:, 0], mean[:, 1], cov[:, 0], cov[:, 1]
     pair = Pair.of(first, second)
     found = minimise_on_interval(_pair_derivatives(pair, criterion), len(mean))
@@ -100,9 +111,9 @@ def _fuse_pairs(mean: Array, cov: Array, criterion: str) -> Fusion:
     pull = pair.from_coordinates(share / total * pair.coordinates(first_mean - second_mean))
     fused_mean, fused_cov = second_mean + pull, pair.rebuild(pair.first * pair.second / total)
     weights = np.stack([omega, 1.0 - omega], -1)
-    near_end = np.minimum(omega, 1.0 - omega) < NEAR_END
+    keep_sole(fused_mean, fused_cov, mean, cov, weights)
     sharp = np.minimum(pair.first.min(0), pair.second.min(0)) < SHARP
-    delicate = near_end | sharp
+    delicate = sharp | ((omega * (1.0 - omega) < NEAR_END) & (omega > 0.0) & (omega < 1.0))
     if delicate.any():
         rows = np.flatnonzero(delicate)
         fused_mean[rows], fused_cov[rows], exact = _fuse_delicate(mean[rows], cov[rows], criterion)
@@ -110,8 +121,70 @@ def _fuse_pairs(mean: Array, cov: Array, criterion: str) -> Fusion:
     return fused_mean, fused_cov, Solution(weights, found.converged, found.iterations)
 
 
+def _fuse_few(mean: Array, cov: Array, criterion: str) -> Fusion:
+    """Fuse a handful of pairs one by one in plain numbers, which spares the overhead of arrays."""
+    parts = [
+        _fuse_one(m, c, criterion) or _fuse_delicate(m[None], c[None], criterion)
+        for m, c in zip(mean, cov, strict=True)
+    ]
+    if len(parts) == 1:
+        return parts[0]
+    means, covs, found = zip(*parts, strict=True)
+    return np.concatenate(means), np.concatenate(covs), Solution.concatenate(found)
+
+
+def _fuse_one(mean: Array, cov: Array, criterion: str) -> Fusion | None:
+    """Fuse one pair, mean (2, n), as a batch of one; None where it is delicate. The equations of `_fuse_pairs`."""
+    pair = SinglePair.of(cov[0], cov[1])
+    if pair is None:
+        return None
+    omega, converged, iterations = minimise_one(_single_derivatives(pair, criterion))
+    found = Solution(np.array([[omega, 1.0 - omega]]), np.array([converged]), np.array([iterations]))
+    if omega in (0.0, 1.0):
+        source = 0 if omega == 1.0 else 1
+        return mean[source][None].copy(), cov[source][None].copy(), found
+    if omega * (1.0 - omega) < NEAR_END:
+        return None
+    totals = [omega * q + (1.0 - omega) * p for p, q in zip(pair.first, pair.second, strict=True)]
+    gain = np.array([omega * q / t for q, t in zip(pair.second, totals, strict=True)])
+    pull = pair.basis @ (gain * (pair.inverse @ (mean[0] - mean[1])))
+    fused = pair.rebuild([p * q / t for p, q, t in zip(pair.first, pair.second, totals, strict=True)])
+    return (mean[1] + pull)[None], fused[None], found
+
+
 #: So close to 0 or 1 the weight's own digits, not the pair's, decide: use the information form.
 NEAR_END = 1e-6
+
+
+def _single_derivatives(pair: SinglePair, criterion: str) -> ScalarDerivatives:
+    """`_pair_derivatives` of one pair in plain numbers."""
+    slopes = [q - p for p, q in zip(pair.first, pair.second, strict=True)]
+    if criterion == "det":
+        axes = list(zip(pair.first, slopes, strict=True))
+
+        def det(w: float) -> tuple[float, float]:
+            slope = curvature = 0.0
+            for p, a in axes:
+                ratio = a / (p + w * a)
+                slope -= ratio
+                curvature += ratio * ratio
+            return slope, curvature
+
+        return det
+    length = (pair.basis * pair.basis).sum(0).tolist()
+    terms = [(p, a, s * p * q) for p, q, a, s in zip(pair.first, pair.second, slopes, length, strict=True)]
+
+    def trace(w: float) -> tuple[float, float]:
+        slope = curvature = 0.0
+        for p, a, s in terms:
+            total = p + w * a
+            ratio = a / total
+            term = s / total * ratio
+            slope -= term
+            curvature += 2.0 * term * ratio
+        return slope, curvature
+
+    return trace
 
 
 def _pair_derivatives(pair: Pair, criterion: str) -> Derivatives:
@@ -150,39 +223,48 @@ def _fuse_delicate(mean: Array, cov: Array, criterion: str) -> Fusion:
 
     found = minimise_on_interval(derivatives, len(mean))
     weights = np.stack([found.weights, 1.0 - found.weights], -1)
-    fused_mean, fused_cov = weighted_product(mean, cov, weights)
-    for source in (0, 1):
-        alone = weights[:, source] == 1.0
-        fused_mean[alone], fused_cov[alone] = mean[alone, source], cov[alone, source]
-    return fused_mean, fused_cov, Solution(weights, found.converged, found.iterations)
+    return *weighted_product(mean, cov, weights), Solution(weights, found.converged, found.iterations)
 
 
 def _fuse_many(mean: Array, cov: Array, criterion: str) -> Fusion:
     """Fuse K > 2 tracks, whitened by the sum of their covariances, by an interior point on the simplex."""
-    lower = np.linalg.cholesky(cov.sum(1))
-    whiten = np.linalg.inv(lower)[:, None]
-    info = inverse(symmetrise(whiten @ cov @ transpose(whiten)))
-    units = transpose(lower) @ lower  # the trace of L P L' is that of P L'L
     batch, count, n = mean.shape
+    lower = np.linalg.cholesky(cov.sum(1))
+    whiten = np.linalg.inv(lower)
+    info = inverse(whiten[:, None] @ cov @ transpose(whiten)[:, None])
+    flat = info.reshape(batch, count, n * n)
+    units = None if criterion == "det" else _whitened_units(lower, flat)
+
+    def fused_at(w: Array, flat: Array) -> Array:
+        return inverse((w[:, None] @ flat).reshape(-1, n, n))
 
     def gradient_hessian(w: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
-        part = info[rows]
-        fused = inverse(np.einsum("bk,bkij->bij", w, part))
-        if criterion == "det":
-            left = right = fused[:, None] @ part
-        else:
-            worth = symmetrise(fused @ units[rows] @ fused)
-            left, right = worth[:, None] @ part, 2.0 * (fused[:, None] @ part)
-        gradient = -np.trace(left, axis1=-2, axis2=-1)
-        flat = left.reshape(len(w), count, n * n), transpose(right).reshape(len(w), count, n * n)
-        return gradient, symmetrise(flat[0] @ transpose(flat[1]))
+        every = len(rows) == batch
+        part, part_flat = (info, flat) if every else (info[rows], flat[rows])
+        fused = fused_at(w, part_flat)
+        # worth is the derivative of the criterion over P; tr(F I_j F I_k) is the product of I_j and F I_k F.
+        worth = fused if units is None else fused @ (units if every else units[rows]) @ fused
+        image = (fused[:, None] @ part @ worth[:, None]).reshape(part_flat.shape)
+        gradient = -(part_flat @ worth.reshape(len(w), n * n, 1))[..., 0]
+        hessian = part_flat @ transpose(image)
+        return gradient, hessian if units is None else hessian + transpose(hessian)
 
     found = minimise_on_simplex(gradient_hessian, batch, count)
-    fused_mean, fused_cov = weighted_product(mean, cov, found.weights)
-    alone = found.weights == 1.0
-    rows, source = np.nonzero(alone)
-    fused_mean[rows], fused_cov[rows] = mean[rows, source], cov[rows, source]
+    fused = fused_at(found.weights, flat)
+    origin = mean[:, :1]
+    pull = (found.weights[..., None] * matvec(info, matvec(whiten[:, None], mean - origin))).sum(1)
+    fused_mean = origin[:, 0] + matvec(lower, matvec(fused, pull))
+    fused_cov = symmetrise(lower @ fused @ transpose(lower))
+    keep_sole(fused_mean, fused_cov, mean, cov, found.weights)
     return fused_mean, fused_cov, found
+
+
+def _whitened_units(lower: Array, info: Array) -> Array:
+    """Return U, (B, n, n), by which tr(U F) is the trace of the fused covariance over that at uniform weights."""
+    units = transpose(lower) @ lower  # the trace of L F L' is that of F L'L
+    n = lower.shape[-1]
+    start = inverse(info.mean(1).reshape(-1, n, n))
+    return np.asarray(units / (start * units).sum((1, 2))[:, None, None])
 
 
 def _trace(a: Array) -> Array:

@@ -1,0 +1,136 @@
+"""Tracks against the truth: errors and consistency, per target and over all."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from track_fusion.linalg import Array
+from track_fusion.metrics.consistency import Consistency, consistency, nees
+from track_fusion.params import Params, param
+from track_fusion.tracks import StateLayout, TrackBatch
+
+#: Fewer samples than this prove nothing.
+MIN_SAMPLES = 10
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationParams(Params):
+    """How tracks are matched with the truth."""
+
+    max_distance_m: float = param(
+        1000.0,
+        "a track farther from every target than this is false, a target without a nearer track missed",
+        unit="m",
+        low=0.0,
+        strict=True,
+    )
+    confirmed_only: bool = param(True, "judge confirmed tracks only")
+
+
+class Evaluation:
+    """Collects truth and tracks by stamp, in any order, and judges each time at which both are there.
+
+    Targets and tracks are matched one to one by least total distance between positions.
+    """
+
+    def __init__(self, layout: StateLayout, params: EvaluationParams) -> None:
+        self._layout, self._params = layout, params
+        self._truth: dict[int, list[TrackBatch]] = defaultdict(list)
+        self._tracks: dict[int, TrackBatch] = {}
+        self._judged: dict[int, list[tuple[int, int, Array, float]]] = {}  # time -> (target, track, error, nees)
+        self._false = 0
+        self._missed = 0
+
+    @property
+    def times(self) -> int:
+        """Number of times judged."""
+        return len(self._judged)
+
+    def add_truth(self, truth: TrackBatch) -> None:
+        """Take the true state of a target."""
+        if len(truth):
+            stamp_ns = int(truth.time_ns[0])
+            self._truth[stamp_ns].append(truth)
+            self._judge(stamp_ns)
+
+    def add_tracks(self, stamp_ns: int, tracks: TrackBatch) -> None:
+        """Take the tracks of a time, also when there are none."""
+        self._tracks[stamp_ns] = tracks[tracks.is_confirmed] if self._params.confirmed_only else tracks
+        self._judge(stamp_ns)
+
+    def _judge(self, stamp_ns: int) -> None:
+        """Judge one time as soon as truth and tracks are there; more truth of the same time judges it again."""
+        if stamp_ns not in self._tracks or stamp_ns not in self._truth:
+            return
+        truth, tracks = TrackBatch.concatenate(self._truth[stamp_ns]), self._tracks[stamp_ns]
+        true_state = truth.moments[0]
+        mean, cov = tracks.moments
+        at = list(self._layout.position)
+        distance = np.linalg.norm(true_state[:, None, at] - mean[None][..., at], axis=-1)
+        target, track = linear_sum_assignment(np.minimum(distance, self._params.max_distance_m))
+        near = distance[target, track] < self._params.max_distance_m
+        target, track = target[near], track[near]
+        error = mean[track] - true_state[target]
+        values = nees(error, cov[track])
+        self._judged[stamp_ns] = [
+            (int(truth.track_id[i]), int(tracks.track_id[j]), e, float(v))
+            for i, j, e, v in zip(target, track, error, values, strict=True)
+        ]
+
+    def _samples(self) -> list[tuple[int, int, int, Array, float]]:
+        return [(t, *sample) for t, samples in sorted(self._judged.items()) for sample in samples]
+
+    def consistency(self) -> Consistency:
+        """ANEES over all targets and times."""
+        return consistency(np.array([s[-1] for s in self._samples()]), self._layout.size)
+
+    def is_overconfident(self) -> bool:
+        """Tell whether errors are larger than the covariances say, on enough samples."""
+        found = self.consistency()
+        return found.samples >= MIN_SAMPLES and found.verdict == "overconfident"
+
+    def result(self) -> dict[str, Any]:
+        """Everything as JSON-ready values: figures over all and for each target, unmatched tracks and targets."""
+        samples = self._samples()
+        targets = sorted({s[1] for s in samples})
+        matched = len(samples)
+        truths = sum(len(b) for t in self._judged for b in self._truth[t])
+        published = sum(len(self._tracks[t]) for t in self._judged)
+        return {
+            "times": self.times,
+            "unmatched_times": len(set(self._truth) ^ set(self._tracks)),
+            "missed": truths - matched,
+            "false": published - matched,
+            "all": self._figures(samples),
+            "targets": {
+                str(t): self._figures([s for s in samples if s[1] == t])
+                | {"track_ids": sorted({s[2] for s in samples if s[1] == t})}
+                for t in targets
+            },
+        }
+
+    def _figures(self, samples: list[tuple[int, int, int, Array, float]]) -> dict[str, Any]:
+        """RMSE, mean error norm (the one-run ARMSE) and consistency of some samples."""
+        errors = np.array([s[3] for s in samples]).reshape(-1, self._layout.size)
+        found = consistency(np.array([s[4] for s in samples]), self._layout.size)
+        figures: dict[str, Any] = {"samples": len(samples)}
+        for name, at, unit in (("position", self._layout.position, "m"), ("velocity", self._layout.velocity, "mps")):
+            norm = np.linalg.norm(errors[:, list(at)], axis=1)
+            figures[f"{name}_rmse_{unit}"] = _number(np.sqrt((norm**2).mean()) if len(norm) else math.nan)
+            figures[f"{name}_armse_{unit}"] = _number(norm.mean() if len(norm) else math.nan)
+        figures |= {
+            "anees": _number(found.anees), "anees_low": _number(found.low), "anees_high": _number(found.high),
+            "verdict": found.verdict,
+        }  # fmt: skip
+        return figures
+
+
+def _number(value: float) -> float | None:
+    """JSON knows no NaN."""
+    return None if math.isnan(value) else float(value)

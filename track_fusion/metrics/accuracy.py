@@ -1,0 +1,43 @@
+"""Root-mean-square errors over Monte Carlo runs, with their Monte Carlo error."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from track_fusion.linalg import Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """A figure measured by Monte Carlo: value, standard error (NaN for one run), number of runs."""
+
+    value: float
+    standard_error: float
+    runs: int
+
+    def spread(self, runs: int) -> float:
+        """Standard deviation that the figure would have in a study of so many runs."""
+        return float(self.standard_error * np.sqrt(self.runs / runs))
+
+
+def rmse(squared_error: Array) -> Array:
+    """Root-mean-square over runs at each step: (R, T) -> (T,)."""
+    return np.asarray(np.sqrt(squared_error.mean(0)))
+
+
+def armse(squared_error: Array) -> Estimate:
+    """Average over the steps of the root-mean-square over runs, standard error by the jackknife.
+
+    Parameters
+    ----------
+    squared_error : (R, T)    squared norm of the error, run by step
+    """
+    runs = len(squared_error)
+    value = float(rmse(squared_error).mean())
+    if runs < 2:
+        return Estimate(value, float("nan"), runs)
+    left_out = np.sqrt((squared_error.sum(0) - squared_error).clip(0) / (runs - 1)).mean(1)
+    variance = (runs - 1) / runs * ((left_out - left_out.mean()) ** 2).sum()
+    return Estimate(value, float(np.sqrt(variance)), runs)

@@ -1,0 +1,89 @@
+"""Evaluator node: truth and tracks in, RMSE and NEES with chi-square bounds out, as JSON at the end."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import PointCloud2
+
+from msg_adapters.odometry import odometry_from_msg
+from msg_adapters.track_table import track_table_from_msg
+from track_fusion.evaluation import Evaluation, EvaluationParams
+from track_fusion.nodes.frames import FrameParams, screened_tracks
+from track_fusion.nodes.managed import ManagedNode, end, run
+from track_fusion.nodes.ros_params import declare
+from track_fusion.params import Params, param
+from track_fusion.tracks import StateLayout
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluatorParams(Params):
+    """What becomes of the result."""
+
+    output: str = param("", "write the result to this JSON file at the end; empty: print it")
+    steps: int = param(0, "end after so many evaluated times; 0: run until told to end", low=0)
+
+
+class EvaluatorNode(ManagedNode):
+    """Carries messages to a :class:`track_fusion.evaluation.Evaluation`."""
+
+    def declare_parameters_(self) -> None:
+        """Declare parameters."""
+        self.frame, self.params = declare(self, FrameParams), declare(self, EvaluatorParams)
+        self.layout = StateLayout(self.frame.axes)
+        self.evaluation = Evaluation(self.layout, declare(self, EvaluationParams))
+        self.finished = False
+        self._warned = False
+
+    def connect(self) -> None:
+        """Create the topics."""
+        self.subscribe(Odometry, "~/truth", self._on_truth, depth=100)
+        self.subscribe(PointCloud2, "~/tracks", self._on_tracks, depth=100)
+
+    def _on_truth(self, msg: Any) -> None:
+        reading = odometry_from_msg(msg, self.layout.axes)
+        self.evaluation.add_truth(screened_tracks(self, reading.tracks, self.layout))
+        self._check()
+
+    def _on_tracks(self, msg: Any) -> None:
+        stamp_ns = msg.header.stamp.sec * 1_000_000_000 + msg.header.stamp.nanosec
+        self.evaluation.add_tracks(stamp_ns, screened_tracks(self, track_table_from_msg(msg), self.layout))
+        self._check()
+
+    def _check(self) -> None:
+        if not self._warned and self.evaluation.is_overconfident():
+            self._warned = True
+            self.log.warning(
+                "The estimator is overconfident: its errors are larger than its covariance says "
+                f"(ANEES {self.evaluation.consistency().anees:.2f})."
+            )
+        self.finished = bool(self.params.steps) and self.evaluation.times >= self.params.steps
+
+    def close(self) -> None:
+        """Write the result."""
+        result = self.evaluation.result()
+        text = json.dumps(result, indent=1, allow_nan=False)
+        if self.params.output:
+            Path(self.params.output).write_text(text + "\n")
+        else:
+            print(text)
+
+    def diagnose(self) -> tuple[list[str], dict[str, Any]]:
+        """Report the consistency so far."""
+        found = self.evaluation.consistency()
+        overconfident = self.evaluation.is_overconfident()
+        values = {"times": self.evaluation.times, "anees": found.anees, "anees_high": found.high}
+        return (["overconfident"] if overconfident else []), values
+
+
+def main() -> None:
+    """Run the node."""
+    end(run(lambda: EvaluatorNode("evaluator")))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,64 @@
+"""The frame and axes of a node's states, and the screening of what arrives in them."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from msg_adapters.arrays import DetectionArrays, MessageError, TrackArrays
+from track_fusion.linalg import Array, is_positive_definite, symmetrise
+from track_fusion.params import Params, param
+from track_fusion.tracks import StateLayout, TrackBatch
+
+if TYPE_CHECKING:
+    from track_fusion.nodes.managed import ManagedNode
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameParams(Params):
+    """In which frame and axes a node works."""
+
+    frame_id: str = param("map", "frame of every state; messages in another frame are rejected")
+    axes: tuple[str, ...] = param(("x", "y", "vx", "vy"), "axes of the state, in order")
+    max_future_s: float = param(
+        0.5, "reject messages stamped further ahead of the node's clock than this", unit="s", low=0.0
+    )
+
+    @property
+    def max_future_ns(self) -> int:
+        """The same in nanoseconds."""
+        return round(self.max_future_s * 1e9)
+
+
+def screened_tracks(node: ManagedNode, arrays: TrackArrays, layout: StateLayout) -> TrackBatch:
+    """Turn decoded arrays into a checked batch in the node's layout; bad tracks are left out and counted.
+
+    Raises
+    ------
+    MessageError    `missing_axis`: the message lacks an axis of the layout
+    """
+    fields = {name: value for name, value in vars(arrays).items() if name != "axes"}
+    batch, rejected = TrackBatch.screened(layout=StateLayout(arrays.axes), **fields)
+    if rejected:
+        ids = sorted(set(arrays.track_id.tolist()) - set(batch.track_id.tolist()))[:5]
+        node.reject(rejected, f"in a scan of {len(arrays.track_id)} tracks, track {', '.join(map(str, ids))}")
+    try:
+        return batch.to_axes(layout)
+    except ValueError as error:
+        raise MessageError("missing_axis", str(error)) from None
+
+
+def screened_detections(node: ManagedNode, scan: DetectionArrays) -> tuple[Array, Array | None]:
+    """Return the usable detections, (D, m) and (D, m, m) or None; bad ones are left out and counted."""
+    good = np.isfinite(scan.value).all(1)
+    if scan.cov is None:
+        node.reject({"not_finite": int((~good).sum())})
+        return scan.value[good], None
+    good &= np.isfinite(scan.cov).all((1, 2))
+    node.reject({"not_finite": int((~good).sum())})
+    value, cov = scan.value[good], symmetrise(scan.cov[good])
+    definite = is_positive_definite(cov)
+    node.reject({"not_positive_definite": int((~definite).sum())})
+    return value[definite], cov[definite]

@@ -1,0 +1,203 @@
+"""Fusion-centre node: source tracks in, fused tracks out."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+from nav_msgs.msg import Odometry
+from rclpy.clock import JumpThreshold
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
+from sensor_msgs.msg import PointCloud2
+from visualization_msgs.msg import MarkerArray
+
+from msg_adapters.arrays import TrackArrays
+from msg_adapters.header import check_header
+from msg_adapters.markers import markers_to_msg
+from msg_adapters.odometry import CrossBlock, odometry_from_msg, odometry_to_msgs
+from msg_adapters.track_table import track_table_from_msg, track_table_to_msg
+from track_fusion.fusion_centre import FusionCentre, FusionCentreParams, StepInfo
+from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
+from track_fusion.nodes.frames import FrameParams, screened_tracks
+from track_fusion.nodes.managed import ManagedNode, end, run
+from track_fusion.nodes.ros_params import declare
+from track_fusion.params import ParameterError, Params, param
+from track_fusion.rules import RULES
+from track_fusion.scan_buffer import ScanBuffer, ScanBufferParams
+from track_fusion.track_manager import TrackManagerParams
+from track_fusion.tracks import StateLayout, TrackBatch
+
+#: Provenance has 32 bits.
+MAX_SOURCES = 32
+#: How often waiting scans and silent sources are looked at, in ROS time.
+LOOK_PERIOD_S = 0.02
+
+
+@dataclasses.dataclass(frozen=True)
+class SourceParams(Params):
+    """Where source tracks come from."""
+
+    source_configurations: tuple[str, ...] = param(
+        ("sensor_1", "sensor_2"), "name of each source; its tracks are read from ~/sources/<name>/tracks"
+    )
+    source_types: tuple[str, ...] = param(
+        (),
+        "message type of each source: track_table (the full posterior) or odometry (one message a track); "
+        "empty: all track_table",
+        choices=("track_table", "odometry"),
+        kind=str,
+    )
+    cross_block: str = param(
+        "block_diagonal",
+        "what stands for the position-velocity block that Odometry lacks: block_diagonal (none), or "
+        "conservative (covers every possible one)",
+        choices=("block_diagonal", "conservative"),
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        names = self.source_configurations
+        if not 1 <= len(names) <= MAX_SOURCES or len(set(names)) < len(names) or not all(names):
+            raise ParameterError(
+                f"The 'source_configurations' parameter must hold 1 to {MAX_SOURCES} distinct names. Got {list(names)}."
+            )
+        if self.source_types and len(self.source_types) != len(names):
+            raise ParameterError(
+                f"The 'source_types' parameter must hold one type a source, {len(names)}. "
+                f"Got {list(self.source_types)}."
+            )
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Message type of each source."""
+        return self.source_types or ("track_table",) * len(self.source_configurations)
+
+
+class FusionCentreNode(ManagedNode):
+    """Carries messages to a :class:`track_fusion.fusion_centre.FusionCentre`; steps as the scan buffer says."""
+
+    def declare_parameters_(self) -> None:
+        """Declare parameters and build the centre."""
+        self.frame, self.sources = declare(self, FrameParams), declare(self, SourceParams)
+        motion = NearlyConstantVelocity(StateLayout(self.frame.axes), declare(self, MotionParams))
+        params = declare(self, FusionCentreParams)
+        rule_params = {key: declare(self, rule.params, f"{key}.") for key, rule in RULES.items()}
+        self.centre = FusionCentre(
+            len(self.sources.source_configurations), motion, self.frame.frame_id, params,
+            rule_params[params.state_fusion], declare(self, TrackManagerParams),
+        )  # fmt: skip
+        self._buffer_params = declare(self, ScanBufferParams)
+        self.buffer = ScanBuffer([k == "odometry" for k in self.sources.kinds], self._buffer_params)
+        self._latency_s = 0.0
+        self._last: StepInfo | None = None
+
+    def connect(self) -> None:
+        """Create the topics and follow the clock."""
+        self._tracks = self.publisher(PointCloud2, "~/tracks", expected=self.managed.expected_subscribers)
+        self._odometry = self.publisher(Odometry, "~/odometry")
+        self._markers = self.publisher(MarkerArray, "~/markers")
+        for k, (name, kind) in enumerate(zip(self.sources.source_configurations, self.sources.kinds, strict=True)):
+            message = PointCloud2 if kind == "track_table" else Odometry
+            depth = 10 if kind == "track_table" else 1000  # a scan of Odometry is a message a track
+            lost = SubscriptionEventCallbacks(message_lost=self._on_lost)
+            self.subscribe(message, f"~/sources/{name}/tracks", self._reader(k, kind), depth, event_callbacks=lost)
+        self.create_timer(LOOK_PERIOD_S, self._on_timer)
+        backward = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
+        self._jump = self.get_clock().create_jump_callback(backward, post_callback=self._on_jump)
+
+    def _on_lost(self, event: Any) -> None:
+        self.reject(
+            {"lost_in_transport": event.total_count_change}, "a queue was full: raise its depth by a QoS override"
+        )
+
+    def _reader(self, source: int, kind: str) -> Callable[[Any], None]:
+        def read(msg: Any) -> None:
+            now = self.now_ns()
+            check_header(msg.header, frame_id=self.frame.frame_id, now_ns=now, max_future_ns=self.frame.max_future_ns)
+            arrays = track_table_from_msg(msg) if kind == "track_table" else self._read_odometry(msg)
+            stamp_ns = msg.header.stamp.sec * 1_000_000_000 + msg.header.stamp.nanosec
+            self._take(source, screened_tracks(self, arrays, self.centre.layout), stamp_ns, now)
+
+        return read
+
+    def _read_odometry(self, msg: Any) -> TrackArrays:
+        cross_block: CrossBlock = "conservative" if self.sources.cross_block == "conservative" else "block_diagonal"
+        reading = odometry_from_msg(msg, self.centre.layout.axes, cross_block)
+        self.counted["cross_block_absent"] += reading.cross_block_absent
+        return reading.tracks
+
+    def _take(self, source: int, scan: TrackBatch, stamp_ns: int, now_ns: int) -> None:
+        reason = self.buffer.add(source, scan, stamp_ns, max(now_ns, stamp_ns))
+        if reason:
+            name = self.sources.source_configurations[source]
+            self.reject({reason: 1}, f"a scan of {name} stamped {stamp_ns / 1e9:.3f} s")
+            return
+        self._advance(max(now_ns, stamp_ns))
+
+    def _on_timer(self) -> None:
+        if not self.active or self._held:
+            return
+        now = self.now_ns()
+        self._advance(now)
+        idle = now - self.buffer.fused_ns >= self._buffer_params.source_timeout_s * 1e9
+        if idle and len(self.centre.tracks) and self.buffer.all_silent(now):
+            self.buffer.fused_ns = now
+            self._step(now, {})
+
+    def _on_jump(self, jump: Any) -> None:
+        self.log.warning("The clock has jumped back: forgetting all tracks and waiting scans.")
+        self.counted["clock_jumps"] += 1
+        self.buffer.reset()
+        self.centre.reset()
+
+    def _advance(self, now_ns: int) -> None:
+        while (ready := self.buffer.pop(now_ns)) is not None:
+            time_ns, scans, superseded = ready
+            self.reject(superseded, "a newer scan of the source came before its fusion")
+            self._step(time_ns, scans)
+
+    def _step(self, time_ns: int, scans: dict[int, TrackBatch]) -> None:
+        began = time.perf_counter()
+        fused, self._last = self.centre.step(time_ns, scans)
+        self._publish(fused, time_ns)
+        self._latency_s = time.perf_counter() - began
+        self.counted["steps"] += 1
+        self.counted["unconverged"] += self._last.unconverged
+        self.counted["deleted"] += len(self._last.changes.deleted)
+
+    def _publish(self, fused: TrackBatch, stamp_ns: int) -> None:
+        axes = self.centre.layout.axes
+        self._tracks.publish(track_table_to_msg(fused, axes, stamp_ns))
+        if self._odometry.get_subscription_count():
+            for msg in odometry_to_msgs(fused, axes):
+                self._odometry.publish(msg)
+        if self._markers.get_subscription_count():
+            self._markers.publish(markers_to_msg(fused, axes, stamp_ns))
+
+    def diagnose(self) -> tuple[list[str], dict[str, Any]]:
+        """Report each source's silence, tracks, latency; warn of silent sources and double counting."""
+        warnings = []
+        values: dict[str, Any] = {"rule": self.centre.rule.key, "tracks": len(self.centre.tracks)}
+        values["step_s"] = round(self._latency_s, 6)
+        for k, name in enumerate(self.sources.source_configurations):
+            silence = self.buffer.silent_since(k, self.now_ns())
+            values[f"silence_s/{name}"] = round(silence, 3)
+            if silence >= self._buffer_params.source_timeout_s:
+                warnings.append(f"{name} is silent for {silence:.1f} s")
+        if self._last is not None:
+            values["members"] = self._last.members.tolist()
+            if self._last.shared_provenance and self.centre.rule.guarantee != "conservative":
+                warnings.append(f"{self.centre.rule.key} counts information twice: sources hold each other's")
+        return warnings, values
+
+
+def main() -> None:
+    """Run the node."""
+    end(run(lambda: FusionCentreNode("fusion_centre")))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,283 @@
+"""What all nodes share: lifecycle with autostart, counted rejections, diagnostics, a clean end."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import sys
+import time
+import traceback
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+import rclpy.utilities
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+
+from msg_adapters.arrays import MessageError
+from msg_adapters.diagnostics import diagnostic_array
+from track_fusion.nodes.ros_params import declare, refuse_unknown
+from track_fusion.params import ParameterError, Params, param
+
+DIAGNOSTICS_PERIOD_S = 1.0
+#: How often a held-back message looks whether the subscribers are there.
+LOOK_PERIOD_S = 0.02
+
+
+@dataclasses.dataclass(frozen=True)
+class ManagedParams(Params):
+    """Life of a node."""
+
+    autostart: bool = param(True, "configure and activate at start; false: wait for lifecycle transitions")
+    expected_subscribers: int = param(
+        0,
+        "hold input back until ~/tracks has so many subscribers, so that none misses the first message; 0: do not wait",
+        low=0,
+    )
+    subscribers_deadline_s: float = param(
+        20.0, "after this wall time work begins without the missing subscribers, with a warning", unit="s", low=0.0
+    )
+
+
+RCLError: type[Exception] = rclpy_implementation.RCLError
+
+
+class Fault(Exception):
+    """An error that ends the node with exit code 1; its text is the reason."""
+
+
+def qos(depth: int) -> QoSProfile:
+    """Reliable, keep the last `depth`: the default of every topic of this package."""
+    return QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=depth)
+
+
+class ManagedNode(LifecycleNode):
+    """A lifecycle node whose subclasses declare parameters, connect topics and handle messages.
+
+    Subclasses define `declare_parameters_` (all of them), `connect` (on configure) and may define
+    `on_start`, `diagnose` and `close`.
+    """
+
+    def __init__(self, name: str, **kwargs: Any) -> None:
+        super().__init__(name, **kwargs)
+        self.log: Any = LifecycleNode.get_logger(self)
+        self.rejected: Counter[str] = Counter()
+        self.counted: Counter[str] = Counter()
+        self.active = False
+        self.outputs: list[tuple[Any, int]] = []
+        self._held: deque[tuple[Callable[[Any], None], Any]] = deque()
+        self._wall = Clock(clock_type=ClockType.STEADY_TIME)
+        self.managed = declare(self, ManagedParams)
+        self.declare_parameters_()
+        refuse_unknown(self)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos(10))
+        self.create_timer(DIAGNOSTICS_PERIOD_S, self._publish_diagnostics, clock=self._wall)
+        if self.managed.autostart:
+            self.autostart()
+
+    # What subclasses fill in.
+
+    def declare_parameters_(self) -> None:
+        """Declare parameters; a ParameterError ends the start-up."""
+
+    def connect(self) -> None:
+        """Create publishers and subscriptions."""
+
+    def on_start(self) -> None:
+        """Begin, after activation."""
+
+    def diagnose(self) -> tuple[list[str], dict[str, Any]]:
+        """Return warnings and values to report."""
+        return [], {}
+
+    def close(self) -> None:
+        """Do last things when the process ends."""
+
+    # Lifecycle.
+
+    def autostart(self) -> None:
+        """Configure and activate; rclpy has no such thing.
+
+        Raises
+        ------
+        Fault    a transition failed (its error is in the log)
+        """
+        transitions: list[Callable[[], Any]] = [self.trigger_configure, self.trigger_activate]
+        for transition in transitions:
+            if transition() != TransitionCallbackReturn.SUCCESS:
+                raise Fault(f"{self.get_name()} could not start.")
+
+    def on_configure(self, state: Any) -> Any:
+        """Connect topics."""
+        return self._guarded(self.connect) if not self.outputs else TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state: Any) -> Any:
+        """Begin to process."""
+        result = super().on_activate(state)
+        if result == TransitionCallbackReturn.SUCCESS:
+            self.active = True
+            result = self._guarded(self._start)
+        self.active = result == TransitionCallbackReturn.SUCCESS
+        return result
+
+    def on_deactivate(self, state: Any) -> Any:
+        """Stop processing; what arrives from now on is ignored."""
+        self.active = False
+        self._held.clear()
+        return super().on_deactivate(state)
+
+    def _guarded(self, action: Callable[[], None]) -> Any:
+        """Run a transition's work; rclpy would swallow its error, so log it and fail."""
+        try:
+            action()
+        except Exception as error:
+            self.log.error(f"{error}\n{traceback.format_exc()}")
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+    def _start(self) -> None:
+        self._began = time.monotonic()
+        if any(self._missing(pub, count) for pub, count in self.outputs):
+            self._look = self.create_timer(LOOK_PERIOD_S, self._release, clock=self._wall)
+        self.on_start()
+
+    # Topics.
+
+    def publisher(self, kind: type, topic: str, depth: int = 10, expected: int = 0) -> Any:
+        """Create a lifecycle publisher, its QoS overridable; input is held back until `expected` subscribe."""
+        pub = LifecycleNode.create_lifecycle_publisher(
+            self, kind, topic, qos(depth), qos_overriding_options=QoSOverridingOptions.with_default_policies()
+        )
+        self.outputs.append((pub, expected))
+        return pub
+
+    def subscribe(self, kind: type, topic: str, handle: Callable[[Any], None], depth: int = 10, **kwargs: Any) -> Any:
+        """Subscribe; `handle` is called while active, and a message that cannot be read is counted, never fatal."""
+
+        def guarded(msg: Any) -> None:
+            if not self.active:
+                return
+            if self._held or any(self._missing(pub, count) for pub, count in self.outputs):
+                self._held.append((handle, msg))
+                return
+            self._handle(handle, msg)
+
+        return self.create_subscription(
+            kind, topic, guarded, qos(depth),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(), **kwargs,
+        )  # fmt: skip
+
+    def _handle(self, handle: Callable[[Any], None], msg: Any) -> None:
+        try:
+            handle(msg)
+        except MessageError as error:
+            self.reject({error.reason: 1}, str(error))
+        except (Fault, ParameterError):
+            raise
+        except Exception as error:  # a fault of ours must not stop the robot: tell it loudly and go on
+            self.reject({"internal_error": 1}, f"{error}\n{traceback.format_exc()}")
+
+    def _missing(self, pub: Any, expected: int) -> bool:
+        if expected == 0 or pub.get_subscription_count() >= expected:
+            return False
+        return time.monotonic() - self._began < self.managed.subscribers_deadline_s
+
+    def _release(self) -> None:
+        """Hand on what was held back once all subscribers are there, or the deadline has passed."""
+        if any(self._missing(pub, count) for pub, count in self.outputs):
+            return
+        self._look.cancel()
+        for pub, count in self.outputs:
+            have = pub.get_subscription_count()
+            if have < count:
+                self.log.warning(f"{pub.topic_name} has {have} of {count} expected subscribers; going on.")
+        # No message is lost silently, however many waited here.
+        self.outputs = [(pub, 0) for pub, _ in self.outputs]
+        self.on_released()
+        while self._held:
+            self._handle(*self._held.popleft())
+
+    def on_released(self) -> None:
+        """Begin what needed the subscribers."""
+
+    # Rejections and diagnostics.
+
+    def reject(self, reasons: dict[str, int] | Counter[str], text: str = "") -> None:
+        """Count rejected messages or tracks by reason, and log the first of each kind."""
+        for reason, count in reasons.items():
+            if count and not self.rejected[reason]:
+                self.log.warning(f"Rejected ({reason}): {text or 'see /diagnostics for the count'}")
+            self.rejected[reason] += count
+
+    def now_ns(self) -> int:
+        """ROS time; 0 until simulated time has begun."""
+        return int(self.get_clock().now().nanoseconds)
+
+    def _publish_diagnostics(self) -> None:
+        warnings, values = self.diagnose()
+        warnings += [f"{sum(self.rejected.values())} rejected"] if self.rejected else []
+        level = DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
+        shown = {"active": self.active, **values, **self.counted}
+        shown |= {f"rejected/{reason}": count for reason, count in sorted(self.rejected.items())}
+        self._diagnostics.publish(
+            diagnostic_array(self.now_ns(), self.get_name(), level, "; ".join(warnings) or "ok", shown)
+        )
+
+
+def run(make: Callable[[], ManagedNode]) -> int:
+    """Run a node until SIGINT, SIGTERM or its own end; return the exit code.
+
+    0: ended as asked; 1: a fault; 2: a parameter was wrong.
+    """
+    node = None
+    try:
+        rclpy.init()
+    except RCLError as error:  # a parameter file that cannot be read, a malformed argument
+        return _failed(str(error), 2)
+    executor = SingleThreadedExecutor()
+    try:
+        node = make()
+        executor.add_node(node)
+        while rclpy.utilities.ok() and not getattr(node, "finished", False):
+            executor.spin_once()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except ParameterError as error:
+        return _failed(str(error), 2)
+    except Fault as error:
+        return _failed(str(error), 1)
+    finally:
+        _close(node)
+    return 0
+
+
+def _failed(text: str, code: int) -> int:
+    print(text, file=sys.stderr)
+    return code
+
+
+def _close(node: ManagedNode | None) -> None:
+    try:
+        if node is not None:
+            node.close()
+    finally:
+        rclpy.utilities.try_shutdown()
+
+
+def end(code: int) -> None:
+    """End the process with this code.
+
+    Destroying a node entity by entity while its context goes down can crash inside DDS; by now all is published and
+    written, so the process leaves without.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)

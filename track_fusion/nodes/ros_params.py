@@ -1,0 +1,78 @@
+"""Parameter dataclasses as ROS parameters: declared with range and description, misspelt ones refused."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, TypeVar
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+
+from track_fusion.params import ParameterError, Params, Spec, from_dict, specs, unknown_name_error
+
+P = TypeVar("P", bound=Params)
+
+#: Parameters that rclpy declares by itself.
+_BUILT_IN = ("use_sim_time", "start_type_description_service")
+_BUILT_IN_PREFIX = "qos_overrides."
+#: ROS ranges need both ends.
+_WIDEST = {float: 1.7e308, int: 2**63 - 1}
+
+
+def declare(node: Node, cls: type[P], prefix: str = "") -> P:
+    """Declare every field of a parameter dataclass on a node and return it with the values given.
+
+    The parameters are read-only: they take effect at start-up.
+
+    Raises
+    ------
+    ParameterError    a value is of the wrong type or out of range; the message names the parameter
+    """
+    values = {}
+    for name, (spec, default) in specs(cls).items():
+        full = prefix + name
+        # ROS knows no empty list without a type: such a default stays unset.
+        start = None if default == () else list(default) if isinstance(default, tuple) else default
+        given = node.declare_parameter(full, start, _descriptor(full, spec)).value
+        values[name] = default if given is None else given
+    try:
+        return from_dict(cls, values)
+    except ParameterError as error:
+        raise ParameterError(str(error).replace("The '", f"The '{prefix}", 1)) from None
+
+
+def _descriptor(name: str, spec: Spec) -> ParameterDescriptor:
+    """Describe a parameter; types and limits are checked by the dataclass, whose messages say more."""
+    descriptor = ParameterDescriptor(
+        name=name,
+        description=spec.doc + (f" [{spec.unit}]" if spec.unit else ""),
+        additional_constraints=spec.wanted(),
+        read_only=True,
+        dynamic_typing=True,
+    )
+    if not spec.sequence and spec.kind in _WIDEST and (spec.low > -math.inf or spec.high < math.inf):
+        widest = _WIDEST[spec.kind]
+        low, high = spec.kind(max(spec.low, -widest)), spec.kind(min(spec.high, widest))
+        if spec.kind is float:
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+        else:
+            descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
+    return descriptor
+
+
+def refuse_unknown(node: Node) -> None:
+    """Check, once all is declared, that every parameter given on start-up exists.
+
+    Raises
+    ------
+    ParameterError    a name is unknown; the nearest valid one is given
+    """
+    valid = [n for n in node._parameters if not n.startswith(_BUILT_IN_PREFIX)]
+    for name in node._parameter_overrides:
+        if name not in valid and name not in _BUILT_IN and not name.startswith(_BUILT_IN_PREFIX):
+            raise unknown_name_error(name, valid)
+
+
+def shown(params: Params) -> dict[str, Any]:
+    """Name and value of each parameter, for a log line."""
+    return {name: getattr(params, name) for name in specs(params)}

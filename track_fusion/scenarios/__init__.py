@@ -1,0 +1,24 @@
+"""Published scenarios, one a file; `SCENARIOS` lists them all by key."""
+
+from __future__ import annotations
+
+from track_fusion.params import unknown_name_error
+from track_fusion.scenarios import li2022_linear
+from track_fusion.scenarios.base import RuleChoice, Scenario, Tracking, figures
+
+SCENARIOS: dict[str, Scenario] = {module.SCENARIO.key: module.SCENARIO for module in (li2022_linear,)}
+
+
+def get_scenario(key: str) -> Scenario:
+    """Return the scenario of this key.
+
+    Raises
+    ------
+    ParameterError    no such scenario; the nearest key is given
+    """
+    if key not in SCENARIOS:
+        raise unknown_name_error(key, SCENARIOS, "scenario")
+    return SCENARIOS[key]
+
+
+__all__ = ["SCENARIOS", "RuleChoice", "Scenario", "Tracking", "figures", "get_scenario"]

@@ -1,0 +1,140 @@
+"""What a scenario is, and how its figures are judged against the published ones."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from track_fusion.linalg import Array
+from track_fusion.metrics.accuracy import Estimate
+from track_fusion.models.measurement import LinearSensor
+from track_fusion.models.motion import NearlyConstantVelocity
+from track_fusion.params import Params
+from track_fusion.random_streams import stream
+
+#: A figure agrees within so many standard deviations of the difference.
+AGREEMENT_SIGMAS = 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Tracking:
+    """One target, sensors and a centre: what the library's study and the ROS nodes are both driven by.
+
+    Attributes
+    ----------
+    motion : NearlyConstantVelocity    of the truth and of the filters; its layout is the scenario's
+    dt_s, steps                        sampling interval in seconds, number of filtering steps
+    initial_mean (n,), initial_cov (n, n)    of every filter
+    sensors : mapping name -> LinearSensor
+    """
+
+    motion: NearlyConstantVelocity
+    dt_s: float
+    steps: int
+    initial_mean: Array
+    initial_cov: Array
+    sensors: Mapping[str, LinearSensor]
+
+    def truth(self, seed: int, run: int) -> Array:
+        """Draw the target's states at steps 0 to T, (T + 1, n); step 0 is the initial mean itself."""
+        transition, factor = self.motion.matrices(self.dt_s)[0], self.motion.noise_factor(self.dt_s)
+        draws = stream(seed, run, "truth").standard_normal((self.steps, factor.shape[1]))
+        states = np.empty((self.steps + 1, len(self.initial_mean)))
+        states[0] = self.initial_mean
+        for k in range(self.steps):
+            states[k + 1] = transition @ states[k] + factor @ draws[k]
+        return states
+
+    def measurements(self, truth: Array, seed: int, run: int) -> dict[str, Array]:
+        """Draw each sensor's measurements at steps 1 to T, (T, m) each."""
+        found = {}
+        for name, sensor in self.sensors.items():
+            factor = np.linalg.cholesky(sensor.noise)
+            draws = stream(seed, run, name).standard_normal((self.steps, len(factor)))
+            found[name] = truth[1:] @ sensor.matrix.T + draws @ factor.T
+        return found
+
+
+@dataclasses.dataclass(frozen=True)
+class RuleChoice:
+    """A rule with the parameters that a scenario gives it, and the name of the variant ("" = the paper's)."""
+
+    key: str
+    params: Params
+    variant: str = ""
+
+    @property
+    def name(self) -> str:
+        """`key` or `key@variant`."""
+        return f"{self.key}@{self.variant}" if self.variant else self.key
+
+
+@dataclasses.dataclass(frozen=True)
+class Scenario:
+    """A published scenario.
+
+    Attributes
+    ----------
+    key, title, paper          identification
+    shows : str                what one learns from it
+    published : mapping        figure name -> published value
+    published_runs : int       Monte Carlo runs behind the published figures
+    default_runs : int         runs for a quick look
+    assumptions : tuple        values and readings that the paper does not give
+    study : callable           (runs, seed, progress) -> {figure name: Estimate}; progress(done share)
+    tracking : Tracking | None what the ROS nodes run; None = library only
+    rules : tuple              the rules it compares, with their parameters
+    """
+
+    key: str
+    title: str
+    paper: str
+    shows: str
+    published: Mapping[str, float]
+    published_runs: int
+    default_runs: int
+    assumptions: tuple[str, ...]
+    study: Callable[[int, int, Callable[[float], None]], dict[str, Estimate]]
+    tracking: Tracking | None
+    rules: tuple[RuleChoice, ...]
+
+
+def figures(scenario: Scenario, measured: Mapping[str, Estimate]) -> list[dict[str, Any]]:
+    """Set measured beside published, one entry a figure: name, value, standard_error, published, verdict."""
+    return [
+        {
+            "name": name,
+            "value": estimate.value,
+            "standard_error": None if math.isnan(estimate.standard_error) else estimate.standard_error,
+            "published": scenario.published.get(name),
+            "verdict": verdict(scenario, name, measured),
+        }
+        for name, estimate in measured.items()
+    ]
+
+
+def verdict(scenario: Scenario, name: str, measured: Mapping[str, Estimate]) -> str:
+    """Judge one figure.
+
+    Returns
+    -------
+    "agrees" (the difference is within 3 standard deviations, Monte Carlo error here and spread of one
+    table of the paper's own run count together), "ordering only" (it stands to every other row of its
+    table as published), "does not reproduce" or "not given"
+    """
+    published, estimate = scenario.published.get(name), measured[name]
+    if published is None or math.isnan(estimate.standard_error):
+        return "not given"
+    error = math.hypot(estimate.standard_error, estimate.spread(scenario.published_runs))
+    if abs(estimate.value - published) <= AGREEMENT_SIGMAS * error:
+        return "agrees"
+    quantity = name.rpartition("/")[2]
+    rows = [n for n in measured if n.rpartition("/")[2] == quantity and n in scenario.published and n != name]
+    kept = all(
+        (estimate.value - measured[n].value) * (published - scenario.published[n]) > 0 for n in rows
+    )  # a tie here where the paper has none is not its order
+    return "ordering only" if rows and kept else "does not reproduce"
