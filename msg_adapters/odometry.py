@@ -262,7 +262,8 @@ def _turned(mean: Floats, cov: Floats, rotation: Floats) -> tuple[Floats, Floats
     for a in parts:
         mean[:, a] = np.einsum("nij,nj->ni", rotation, mean[:, a])
         for b in parts:
-            cov[:, a, b] = rotation @ cov[:, a, b] @ rotation.swapaxes(-1, -2)
+            with np.errstate(invalid="ignore"):  # the library judges what is not finite
+                cov[:, a, b] = rotation @ cov[:, a, b] @ rotation.swapaxes(-1, -2)
     return mean, cov
 
 
