@@ -49,7 +49,8 @@ def ros_arguments(name: str, config: Path | None, params: Mapping[str, Any], rem
     words = ["--ros-args", "-r", f"__node:={name}"]
     words += ["--params-file", str(config)] if config else []
     for key, value in params.items():
-        words += ["-p", f"{key}:={json.dumps(value)}"]
+        # With the node's name: a bare one would stand behind what the file says of this node.
+        words += ["-p", f"{name}:{key}:={json.dumps(value)}"]
     for source, target in remaps.items():
         words += ["-r", f"{source}:={target}"]
     return words
