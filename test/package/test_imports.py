@@ -84,7 +84,7 @@ def test_the_library_imports_without_ros() -> None:
 
 @pytest.mark.colcon
 def test_the_nodes_import_without_extras() -> None:
-    done = import_all(nodes=True, blocked={"click", "rich", "matplotlib", "rosbags", "yaml"})
+    done = import_all(nodes=True, blocked={"click", "rich", "matplotlib", "rosbags"})
     assert {f"track_fusion.nodes.{n}" for n in ("sensor_tracker", "fusion_centre", "replay", "evaluator")} <= done
 
 

@@ -75,8 +75,8 @@ def test_ros_imports_are_stated_in_package_xml() -> None:
 
 
 def test_the_entry_points_are_the_nodes_and_the_command(executables: dict[str, str]) -> None:
-    assert executables.pop("track-fusion") == "track_fusion.cli:main"
-    assert executables == {name: f"track_fusion.nodes.{name}:main" for name in NODES}
+    nodes = {name: f"track_fusion.nodes.{name}:main" for name in NODES}
+    assert executables == {**nodes, "track-fusion": "track_fusion.cli:main"}
 
 
 @pytest.mark.parametrize("name", [*sorted(NODES), "track-fusion"])
