@@ -7,6 +7,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+#: Relative asymmetry up to which a covariance is taken as symmetric with rounding noise.
+ASYMMETRY_TOLERANCE = 1e-6
+
 
 def transpose(a: Array) -> Array:
     """Swap the last two axes."""

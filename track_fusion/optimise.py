@@ -139,7 +139,7 @@ def minimise_on_simplex(gradient_hessian: GradientHessian, count: int, sources: 
         gradient, hessian = gradient_hessian(w, rows)
         excess = gradient - gradient.min(1, keepdims=True)
         if step == 1:  # multipliers that fit the gradient and are far from zero
-            z = excess + 3.0 * excess.max(1, keepdims=True)
+            z = excess + excess.max(1, keepdims=True)
         scale = np.maximum(1.0, np.abs(gradient).max(1))
         gap = (w * z).sum(1) / scale
         done = ((w * excess).sum(1) <= GAP * scale) | ((gap <= GAP) & (moved <= SHORT_STEP))
@@ -162,7 +162,7 @@ def _interior_step(
     The aim and the distance kept from the boundary shrink with the gap, so that the last steps square it.
     """
     sources = w.shape[1]
-    centre = (np.minimum(.1, gap) * gap * scale / sources)[:, None] / w
+    centre = (np.minimum(.01, gap) * gap * scale / sources)[:, None] / w
     kkt = np.ones((len(w), sources + 1, sources + 1))
     kkt[:, :sources, :sources] = hessian
     diagonal = np.arange(sources)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.linalg import Array, is_positive_definite, outer, symmetrise, transpose
+from track_fusion.linalg import ASYMMETRY_TOLERANCE, Array, is_positive_definite, outer, symmetrise, transpose
 
 # Bits of `status`.
 CONFIRMED = 1
@@ -22,8 +22,6 @@ UUID_BYTES = 16
 #: A state value beyond this, or a standard deviation beyond it, is a fault of the sender: the
 #: squares and inverses of such numbers no longer fit double precision.
 ABSURD = 1e12
-#: Relative asymmetry up to which a covariance is taken as rounding noise and symmetrised.
-ASYMMETRY_TOLERANCE = 1e-6
 #: How far the weights of a normalised mixture may sum from one.
 WEIGHT_TOLERANCE = 1e-6
 
@@ -296,7 +294,7 @@ def _coerce(batch: TrackBatch) -> None:
 def _faults(batch: TrackBatch) -> dict[str, NDArray[np.bool_]]:
     """Tell by reason which tracks are bad, in the order in which reasons are reported."""
     none = np.zeros(len(batch), bool)
-    finite = np.isfinite(batch.mean).all((1, 2)) & np.isfinite(batch.cov).all((1, 2, 3))
+    finite = np.asarray(np.isfinite(batch.mean).all((1, 2)) & np.isfinite(batch.cov).all((1, 2, 3)))
     safe = batch.cov if finite.all() else np.where(finite[:, None, None, None], batch.cov, np.eye(batch.layout.size))
     size = np.abs(safe).max((1, 2, 3), initial=0.0)
     with np.errstate(invalid="ignore"):
@@ -322,10 +320,10 @@ def _faults(batch: TrackBatch) -> dict[str, NDArray[np.bool_]]:
 
 def _definite(batch: TrackBatch, cov: Array, size: Array) -> NDArray[np.bool_]:
     """Positive definite throughout, or a particle track: several components, all without covariance."""
-    good = is_positive_definite(symmetrise(cov)).all(1)
+    good = np.asarray(is_positive_definite(symmetrise(cov)).all(1))
     if good.all():
         return good
-    return good | ((size == 0) & ((batch.weight > 0).sum(1) > 1))
+    return np.asarray(good | ((size == 0) & ((batch.weight > 0).sum(1) > 1)))
 
 
 def _repeated(ids: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from track_fusion.linalg import Array
+from track_fusion.linalg import ASYMMETRY_TOLERANCE, Array, is_positive_definite, symmetrise, transpose
 from track_fusion.params import Params
 
 Family = Literal["gaussian", "elliptical", "mixture"]
@@ -91,6 +91,19 @@ class Rule:
     needs: tuple[str, ...] = ()  # names of `extras`
     affine_equivariant: bool | str = True  # a string says why not, or under which parameters
 
+    def __call__(self, tracks: SourceTracks, params: Params | None = None) -> FusedTracks:
+        """Check the tracks, then fuse them; `fuse` alone trusts them, for callers that screened them before.
+
+        Raises
+        ------
+        ValueError    the tracks are malformed, or lack what the rule needs
+        """
+        check_tracks(tracks)
+        missing = [name for name in self.needs if name not in tracks.extras]
+        if missing:
+            raise ValueError(f"The rule '{self.key}' needs '{missing[0]}' beside the tracks. Got none.")
+        return self.fuse(tracks, self.params() if params is None else params)
+
 
 def check_weights(weights: tuple[float, ...], count: int, total: float = 1.0) -> Array:
     """Return given fusion weights as an array, or say what is wrong with them.
@@ -108,18 +121,53 @@ def check_weights(weights: tuple[float, ...], count: int, total: float = 1.0) ->
 
 
 def check_tracks(tracks: SourceTracks) -> None:
-    """Check shapes and finiteness of what a rule is given.
+    """Check what a rule is given: shapes, finiteness, definiteness.
 
     Raises
     ------
-    ValueError    a shape does not fit, no source, or a value is not finite
+    ValueError    a shape does not fit, no source, a value is not finite, a covariance not symmetric or
+                  not positive definite, dof not above 2, a weight of a mixture negative
     """
     mean, cov = tracks.mean, tracks.cov
     if mean.ndim < 2 or mean.shape[-2] < 1 or mean.shape[-1] < 1:
         raise ValueError(f"The 'mean' of source tracks must have shape (..., K >= 1, n >= 1). Got {mean.shape}.")
-    if cov.shape != (*mean.shape, mean.shape[-1]):
+    _check_shape("cov", cov, (*mean.shape, mean.shape[-1]))
+    _check_finite("mean", mean)
+    _check_finite("cov", cov)
+    if (np.abs(cov - transpose(cov)) > ASYMMETRY_TOLERANCE * np.abs(cov).max((-2, -1), keepdims=True)).any():
+        raise ValueError("The 'cov' of source tracks must be symmetric.")
+    good = is_positive_definite(cov)
+    if not good.all():
+        lowest = np.linalg.eigvalsh(symmetrise(cov[~good])).min()
         raise ValueError(
-            f"The 'cov' of source tracks must have shape {(*mean.shape, mean.shape[-1])}. Got {cov.shape}."
+            f"The 'cov' of source tracks must be positive definite: {(~good).sum()} of {good.size} are not. "
+            f"Smallest eigenvalue: {lowest:.3g}."
         )
-    if not (np.isfinite(mean).all() and np.isfinite(cov).all()):
-        raise ValueError("The 'mean' and 'cov' of source tracks must be finite.")
+    if tracks.dof is not None:
+        _check_shape("dof", tracks.dof, mean.shape[:-1])
+        if not (tracks.dof > 2).all():
+            raise ValueError(f"The 'dof' of source tracks must exceed 2. Got {np.min(tracks.dof)}.")
+    if tracks.mixture is not None:
+        _check_mixture(tracks.mixture, mean.shape)
+
+
+def _check_mixture(mixture: Mixture, shape: tuple[int, ...]) -> None:
+    *batch, n = shape
+    part = mixture.weight.shape[-1:]
+    _check_shape("mixture.weight", mixture.weight, (*batch, *part))
+    _check_shape("mixture.mean", mixture.mean, (*batch, *part, n))
+    _check_shape("mixture.cov", mixture.cov, (*batch, *part, n, n))
+    for name in ("weight", "mean", "cov"):
+        _check_finite(f"mixture.{name}", getattr(mixture, name))
+    if (mixture.weight < 0).any():
+        raise ValueError(f"The 'mixture.weight' of source tracks must be non-negative. Got {mixture.weight.min()}.")
+
+
+def _check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:
+    if value.shape != shape:
+        raise ValueError(f"The '{name}' of source tracks must have shape {shape}. Got {value.shape}.")
+
+
+def _check_finite(name: str, value: Array) -> None:
+    if not np.isfinite(value).all():
+        raise ValueError(f"The '{name}' of source tracks must be finite.")

@@ -22,7 +22,7 @@ from track_fusion.params import Params, param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
 
 #: Large batches are worked on in pieces whose arrays stay in the cache.
-PAIR_CHUNK, MANY_CHUNK = 1024, 256
+PAIR_CHUNK, MANY_CHUNK = 1024, 512
 #: Up to so many pairs, plain numbers are faster than arrays.
 FEW = 8
 
@@ -240,7 +240,8 @@ def _fuse_many(mean: Array, cov: Array, criterion: str) -> Fusion:
 
     def gradient_hessian(w: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
         every = len(rows) == batch
-        part, part_flat = (info, flat) if every else (info[rows], flat[rows])
+        part = info if every else info[rows]
+        part_flat = part.reshape(len(w), count, n * n)
         fused = fused_at(w, part_flat)
         # worth is the derivative of the criterion over P; tr(F I_j F I_k) is the product of I_j and F I_k F.
         worth = fused if units is None else fused @ (units if every else units[rows]) @ fused
