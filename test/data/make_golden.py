@@ -319,7 +319,8 @@ def run_centre(scans, rule):
             track["confirmed"] |= any(sum(u[-n:]) >= m for u in track["updates"].values())
             p, q = PARAMETERS["deletion_threshold"]
             worn_out = all(u[-q:].count(False) >= p for u in track["updates"].values() if any(u))
-            if not worn_out and (t - track["last_member_ns"]) / 1e9 <= PARAMETERS["max_coast_s"]:
+            overdue = (t - track["last_member_ns"]) / 1e9 > PARAMETERS["max_coast_s"]
+            if track["members"] or not (worn_out or overdue):
                 kept.append(track)
         central = kept
         # 8: publish.
@@ -327,7 +328,7 @@ def run_centre(scans, rule):
         for track in central:
             if track["confirmed"]:
                 bits = sum(2**k for k, source in enumerate(sources) if source in track["members"])
-                row = {"track_id": track["track_id"], "source": bits, "status": CONFIRMED if bits else COASTED}
+                row = {"track_id": track["track_id"], "source": bits, "status": CONFIRMED + (0 if bits else COASTED)}
                 table.append(row | {"mean": track["mean"].tolist(), "cov": track["cov"].tolist()})
         steps.append({"stamp_ns": t, "tracks": table})
         members = {(s, m["track_id"]): track["track_id"] for track in central for s, m in track["members"].items()}
@@ -358,7 +359,7 @@ def check(name, steps, log, margins, truth):
         for track_id, row in rows.items():
             dead = track_id == 2 and k >= DEATH
             bits = 0 if dead else 1 if k == LOST[1] else 3
-            assert (row["source"], row["status"]) == (bits, COASTED if dead else CONFIRMED), (k, row)
+            assert (row["source"], row["status"]) == (bits, CONFIRMED + COASTED * dead), (k, row)
             assert np.linalg.eigvalsh(row["cov"]).min() > 1e-3, "a covariance is not positive definite"
             errors = {target: np.array(row["mean"]) - states[k] for target, states in truth.items() if k in states}
             d2 = {target: e @ np.linalg.inv(row["cov"]) @ e for target, e in errors.items()}
