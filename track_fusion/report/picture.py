@@ -1,0 +1,84 @@
+"""A picture of truth, source tracks and fused track with 2-sigma ellipses."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from track_fusion.linalg import Array
+
+#: Ellipses are drawn at this many standard deviations.
+SIGMAS = 2.0
+#: Every so many steps, so that ellipses stay apart.
+ELLIPSE_EVERY = 5
+#: The close-up shows the last steps.
+CLOSE_UP = 25
+
+
+@dataclasses.dataclass(frozen=True)
+class Line:
+    """One track over time: position (T, 2) in metres, position covariance (T, 2, 2) or None for the truth."""
+
+    label: str
+    color: str
+    position: Array
+    cov: Array | None = None
+
+
+def draw(path: Path, title: str, truth: Line, tracks: Sequence[Line], errors: str = "position error") -> None:
+    """Draw the whole course, a close-up of its end, and each track's position error over time, as PNG.
+
+    Parameters
+    ----------
+    path : Path
+    title : str
+    truth : Line               cov None
+    tracks : sequence of Line  the same T steps; the last is drawn on top with its ellipses
+    errors : str               title of the error panel
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, (course, close, error) = plt.subplots(1, 3, figsize=(16, 5.2), constrained_layout=True)
+    figure.suptitle(title)
+    for axes, start in ((course, 0), (close, max(0, len(truth.position) - CLOSE_UP))):
+        axes.plot(*truth.position[start:].T, color=truth.color, lw=2.0, label=truth.label)
+        for line in tracks:
+            axes.plot(*line.position[start:].T, ".-", ms=3, lw=0.9, color=line.color, label=line.label)
+        if start:
+            for line in tracks:
+                _ellipses(axes, line, start)
+        axes.set_aspect("equal", "datalim")
+        axes.set_xlabel("x / m")
+        axes.set_ylabel("y / m")
+    course.legend(loc="best", fontsize=9)
+    course.set_title("course")
+    close.set_title(f"last {CLOSE_UP} steps, {SIGMAS:g}-sigma ellipses every {ELLIPSE_EVERY}")
+    for line in tracks:
+        error.plot(np.linalg.norm(line.position - truth.position, axis=1), color=line.color, label=line.label)
+    error.set_title(errors)
+    error.set_xlabel("step")
+    error.set_ylabel("m")
+    error.set_ylim(bottom=0)
+    for axes in (course, close, error):
+        axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _ellipses(axes: Any, line: Line, start: int) -> None:
+    from matplotlib.patches import Ellipse
+
+    if line.cov is None:
+        return
+    for k in range(len(line.position) - 1, start - 1, -ELLIPSE_EVERY):
+        values, vectors = np.linalg.eigh(line.cov[k])
+        width, height = 2.0 * SIGMAS * np.sqrt(values)
+        angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
+        axes.add_patch(Ellipse(line.position[k], width, height, angle=angle, fill=False, color=line.color, alpha=0.8))
