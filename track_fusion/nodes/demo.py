@@ -184,18 +184,25 @@ def _figures(
     """
     scenario, rows = demo.scenario, [f"kf-{name}" for name in over_ros]
     listed: list[dict[str, Any]] = []
-    judged = {f["name"]: f for f in figures(scenario, many)}
     for row, measured in zip(rows, over_ros.values(), strict=True):
-        for quantity, value in measured.items():
+        for quantity in measured:
             name = f"{row}/{quantity}"
-            single = {"standard_error": many[name].spread(1), "published": None, "verdict": "not given"}
-            listed.append({"name": f"ros/{name}", "value": value, **single})
-            listed.append({"name": f"library/{name}", "value": same[name].value, **single})
-    for name, figure in judged.items():
+            for path, value in (("ros", measured[quantity]), ("library", same[name].value)):
+                single = Estimate(value, many[name].spread(1), 1)
+                (figure,) = figures(scenario, {name: single})
+                listed.append({**figure, "name": f"{path}/{name}"})
+    for figure in figures(scenario, many):
+        name = figure["name"]
         row, _, quantity = name.rpartition("/")
         variant = f"{row},{demo.library_runs}-runs" if "@" in row else f"{row}@{demo.library_runs}-runs"
         listed.append({**figure, "name": f"library/{variant}/{quantity}"})
-    return {"scenario": scenario.key, "runs": 1, "seed": demo.seed, "library_runs": demo.library_runs, "figures": listed}
+    return {
+        "scenario": scenario.key,
+        "runs": 1,
+        "seed": demo.seed,
+        "library_runs": demo.library_runs,
+        "figures": listed,
+    }
 
 
 def _picture(demo: Demo) -> None:

@@ -14,9 +14,9 @@ from track_fusion.linalg import Array
 #: Ellipses are drawn at this many standard deviations.
 SIGMAS = 2.0
 #: Every so many steps, so that ellipses stay apart.
-ELLIPSE_EVERY = 5
+ELLIPSE_EVERY = 2
 #: The close-up shows the last steps.
-CLOSE_UP = 25
+CLOSE_UP = 9
 
 
 @dataclasses.dataclass(frozen=True)
