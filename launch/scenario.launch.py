@@ -7,17 +7,18 @@ replay node does.
 """
 
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 
 import yaml
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown, TimerAction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
 
 PACKAGE = "track_fusion"
 FUSED = "/fusion_centre/tracks"
+END_S = 1.0  # from the end of the replay to that of the rest: the last messages are still to be read
 # Launch arguments that override a parameter of the file: argument, node, parameter, type.
 OVERRIDES = (
     ("rule", "fusion_centre", "state_fusion", str),
@@ -67,8 +68,8 @@ def scenario_nodes(context):
         remappings[sensor] = [("~/detections", f"/replay/{sensor}/detections"), ("~/feedback", FUSED)]
     # Replay comes last: by then the others are starting already.
     nodes = [node(context, name, parameter_file, remappings[name]) for name in (*sensors, "fusion_centre", "evaluator")]
-    over = Shutdown(reason="the replay is over")
-    return [*nodes, node(context, "replay", parameter_file, remappings["replay"], on_exit=over)]
+    over = TimerAction(period=END_S, actions=[Shutdown(reason="the replay is over")])
+    return [*nodes, node(context, "replay", parameter_file, remappings["replay"], on_exit=[over])]
 
 
 def node(context, name, parameter_file, remappings, **options):
@@ -77,21 +78,29 @@ def node(context, name, parameter_file, remappings, **options):
         package=PACKAGE,
         executable="sensor_tracker" if name.startswith("sensor_") else name,
         name=name,
-        parameters=[str(parameter_file), *overrides(context, name)],
+        parameters=[str(parameter_file), *override_file(context, name)],
         remappings=remappings,
         output="screen",
         **options,
     )
 
 
-def overrides(context, name):
-    """Return the parameters of one node that were given as launch arguments."""
-    given = {
-        parameter: ParameterValue(LaunchConfiguration(argument), value_type=kind)
-        for argument, owner, parameter, kind in OVERRIDES
-        if owner == name and LaunchConfiguration(argument).perform(context)
-    }
-    return [given] if given else []
+def override_file(context, name):
+    """Write the launch arguments given for one node to a parameter file of its own.
+
+    launch would do the same with a dictionary, but for all nodes ("/**"), and what the first file says of this node
+    would win over that when it has a section for all nodes, too.
+    """
+    given = {}
+    for argument, owner, parameter, kind in OVERRIDES:
+        text = LaunchConfiguration(argument).perform(context)
+        if owner == name and text:
+            given[parameter] = kind(text)
+    if not given:
+        return []
+    with NamedTemporaryFile("w", prefix=f"{name}_", suffix=".yaml", delete=False) as file:
+        yaml.safe_dump({name: {"ros__parameters": given}}, file)
+    return [file.name]
 
 
 def find_parameter_file(scenario):

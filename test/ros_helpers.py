@@ -8,7 +8,6 @@ with NodeProcess("fusion_centre", params={"rule": "naive"}) as centre, Probe(ros
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -20,6 +19,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from track_fusion.nodes.bringup import ros_arguments
+
 STOP_DEADLINE_S = 5.0  # from a signal to the end of the process; a node takes well under one second
 POLL_S = 0.02  # how often a condition is looked at while nothing arrives
 
@@ -29,29 +30,6 @@ _pause = threading.Event().wait
 LAUNCHER = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.execv(sys.argv[1], sys.argv[1:])"
 # Set by the ROS wheels' start-up hook; another environment's Python must find its own libraries.
 WHEEL_VARIABLES = ("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "LD_LIBRARY_PATH")
-
-
-def parameter_value(value: Any) -> str:
-    """Write a parameter as the YAML that `-p name:=value` takes; JSON is YAML, except for non-finite floats."""
-    if isinstance(value, float):
-        return {"inf": ".inf", "-inf": "-.inf", "nan": ".nan"}.get(repr(value), repr(value))
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(parameter_value(item) for item in value) + "]"
-    return json.dumps(value)
-
-
-def ros_arguments(
-    node: str | None, params_file: str | Path | None, params: Mapping[str, Any], remaps: Mapping[str, str]
-) -> list[str]:
-    """Build what follows a node's name on its command line."""
-    words = ["--ros-args"]
-    words += ["-r", f"__node:={node}"] if node else []
-    words += ["--params-file", str(params_file)] if params_file else []
-    for name, value in params.items():
-        words += ["-p", f"{name}:={parameter_value(value)}"]
-    for source, target in remaps.items():
-        words += ["-r", f"{source}:={target}"]
-    return words
 
 
 class NodeProcess:
@@ -82,7 +60,7 @@ class NodeProcess:
         self.name = node or executable
         if command is None:
             command = ["-m", f"track_fusion.nodes.{executable}"]
-            command += ros_arguments(node, params_file, params or {}, remaps or {})
+            command += ros_arguments(self.name, params_file and Path(params_file), params or {}, remaps or {})
         environment = {**os.environ, "PYTHONUNBUFFERED": "1", **(env or {})}
         if str(python) != sys.executable:
             for variable in WHEEL_VARIABLES:

@@ -51,17 +51,6 @@ class PathJoinSubstitution:
 
 
 @dataclasses.dataclass
-class ParameterValue:
-    value: Any
-    value_type: type = str
-    _: dataclasses.KW_ONLY
-    description: str = ""
-
-    def evaluate(self, context: Context) -> Any:
-        return self.value_type(perform(self.value, context))
-
-
-@dataclasses.dataclass
 class DeclareLaunchArgument:
     name: str
     _: dataclasses.KW_ONLY
@@ -80,6 +69,13 @@ class OpaqueFunction:
 class Shutdown:
     _: dataclasses.KW_ONLY
     reason: str = ""
+
+
+@dataclasses.dataclass
+class TimerAction:
+    _: dataclasses.KW_ONLY
+    period: float
+    actions: list[Any]
 
 
 @dataclasses.dataclass
@@ -104,7 +100,7 @@ class Node:
     parameters: list[Any] = dataclasses.field(default_factory=list)
     remappings: list[tuple[str, str]] = dataclasses.field(default_factory=list)
     output: str = "log"
-    on_exit: Any = None
+    on_exit: list[Any] = dataclasses.field(default_factory=list)
 
 
 class LaunchDescription:
@@ -120,16 +116,26 @@ class Described:
     executable: str
     name: str
     parameter_files: list[Path]
-    parameters: dict[str, Any]
     remappings: dict[str, str]
     ends_launch: bool
 
     @classmethod
     def from_node(cls, node: Node, context: Context) -> Described:
-        files = [Path(item) for item in node.parameters if not isinstance(item, dict)]
-        given = {k: v.evaluate(context) for item in node.parameters if isinstance(item, dict) for k, v in item.items()}
-        ends = isinstance(node.on_exit, Shutdown)
-        return cls(node.package, node.executable, node.name, files, given, dict(node.remappings), ends)
+        files = [Path(perform(item, context)) for item in node.parameters]
+        after = [
+            action for item in node.on_exit for action in (item.actions if isinstance(item, TimerAction) else [item])
+        ]
+        ends = any(isinstance(action, Shutdown) for action in after)
+        return cls(node.package, node.executable, node.name, files, dict(node.remappings), ends)
+
+    def command_line(self) -> list[str]:
+        """What launch puts behind the executable."""
+        words = ["--ros-args", "-r", f"__node:={self.name}"]
+        for path in self.parameter_files:
+            words += ["--params-file", str(path)]
+        for source, target in self.remappings.items():
+            words += ["-r", f"{source}:={target}"]
+        return words
 
 
 @dataclasses.dataclass
@@ -196,12 +202,11 @@ def stand_in_modules(share: Path) -> dict[str, types.ModuleType]:
 
     contents: dict[str, tuple[Any, ...]] = {
         "launch": (LaunchDescription,),
-        "launch.actions": (DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction, Shutdown),
+        "launch.actions": (DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction, Shutdown, TimerAction),
         "launch.launch_description_sources": (PythonLaunchDescriptionSource,),
         "launch.substitutions": (LaunchConfiguration, PathJoinSubstitution),
         "launch_ros": (),
         "launch_ros.actions": (Node,),
-        "launch_ros.parameter_descriptions": (ParameterValue,),
         "launch_ros.substitutions": (FindPackageShare,),
         "ament_index_python": (),
         "ament_index_python.packages": (get_package_share_directory,),

@@ -9,12 +9,15 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
 from package import launch_stand_in
+from rcl_interfaces.srv import GetParameters
+from rclpy.node import NodeNameNonExistentError
 from ros_helpers import NodeProcess, Probe
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -23,35 +26,37 @@ NODES = ["replay", "sensor_1", "sensor_2", "fusion_centre", "evaluator"]
 SCENARIO_DEADLINE_S = 60.0  # the scenario's steps in lockstep take about one second
 
 
+@pytest.fixture(autouse=True)
+def _temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+
+def nodes_of(launch: str, **arguments: str) -> dict[str, launch_stand_in.Described]:
+    """Return the nodes of a launch file by name, in the order in which they are started."""
+    nodes = launch_stand_in.load(ROOT / "launch" / f"{launch}.launch.py", ROOT, **arguments).nodes
+    return {node.name: node for node in nodes}
+
+
 def start(node: launch_stand_in.Described) -> NodeProcess:
     """Start a node as launch would."""
-    return NodeProcess(
-        node.executable,
-        node=node.name,
-        params_file=node.parameter_files[0],
-        params=node.parameters,
-        remaps=node.remappings,
-        python=PYTHON,
-    )
-
-
-def described(name: str) -> launch_stand_in.Described:
-    """Return one node of demo.launch.py."""
-    nodes = launch_stand_in.load(ROOT / "launch" / "demo.launch.py", ROOT).nodes
-    return next(node for node in nodes if node.name == name)
+    command = ["-m", f"track_fusion.nodes.{node.executable}", *node.command_line()]
+    return NodeProcess(node.executable, node=node.name, command=command, python=PYTHON)
 
 
 def topics_of(probe: Probe, name: str) -> set[str]:
-    """Return what a node publishes and subscribes to."""
-    published = probe.node.get_publisher_names_and_types_by_node(name, "/")
-    subscribed = probe.node.get_subscriber_names_and_types_by_node(name, "/")
+    """Return what a node publishes and subscribes to, as far as it has been discovered."""
+    try:
+        published = probe.node.get_publisher_names_and_types_by_node(name, "/")
+        subscribed = probe.node.get_subscriber_names_and_types_by_node(name, "/")
+    except NodeNameNonExistentError:
+        return set()
     return {topic for topic, _ in (*published, *subscribed)}
 
 
 @pytest.mark.parametrize("name", NODES)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
 def test_a_node_starts_has_its_topics_and_ends(name: str, number: int, ros_context: Any) -> None:
-    node = described(name)
+    node = nodes_of("demo")[name]
     with start(node) as process, Probe(ros_context) as probe:
         probe.wait_for_state(f"/{name}", "active")
         wanted = set(node.remappings.values())
@@ -60,11 +65,18 @@ def test_a_node_starts_has_its_topics_and_ends(name: str, number: int, ros_conte
         assert process.stop(number) == 0, process.output()
 
 
+def test_launch_arguments_override_the_parameter_file(ros_context: Any) -> None:
+    node = nodes_of("scenario", rule="naive")["fusion_centre"]
+    with start(node), Probe(ros_context) as probe:
+        request = GetParameters.Request(names=["state_fusion"])
+        values = probe.call("/fusion_centre/get_parameters", GetParameters, request).values
+        assert [value.string_value for value in values] == ["naive"]
+
+
 def test_the_demo_launch_runs_to_its_end(ros_domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    nodes = launch_stand_in.load(ROOT / "launch" / "demo.launch.py", ROOT).nodes
     with ExitStack() as stack:
-        running = {node.name: stack.enter_context(start(node)) for node in nodes}
+        running = {name: stack.enter_context(start(node)) for name, node in nodes_of("demo").items()}
         assert running["replay"].wait(SCENARIO_DEADLINE_S) == 0
         for name, process in running.items():
             assert process.stop() == 0, f"{name}: {process.output()}"
