@@ -35,8 +35,13 @@ class EvaluatorNode(ManagedNode):
         """Declare parameters."""
         self.frame, self.params = declare(self, FrameParams), declare(self, EvaluatorParams)
         self.layout = StateLayout(self.frame.axes)
-        self.evaluation = Evaluation(self.layout, declare(self, EvaluationParams))
+        self._evaluation_params = declare(self, EvaluationParams)
         self.finished = False
+        self.on_clock_jump()
+
+    def on_clock_jump(self) -> None:
+        """Begin to judge anew: the same stamps will come again."""
+        self.evaluation = Evaluation(self.layout, self._evaluation_params)
         self._warned = False
 
     def connect(self) -> None:

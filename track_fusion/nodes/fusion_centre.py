@@ -8,8 +8,6 @@ from collections.abc import Callable
 from typing import Any
 
 from nav_msgs.msg import Odometry
-from rclpy.clock import JumpThreshold
-from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
@@ -95,7 +93,7 @@ class FusionCentreNode(ManagedNode):
         self._last: StepInfo | None = None
 
     def connect(self) -> None:
-        """Create the topics and follow the clock."""
+        """Create the topics."""
         self._tracks = self.publisher(PointCloud2, "~/tracks", expected=self.managed.expected_subscribers)
         self._odometry = self.publisher(Odometry, "~/odometry")
         self._markers = self.publisher(MarkerArray, "~/markers")
@@ -105,8 +103,6 @@ class FusionCentreNode(ManagedNode):
             lost = SubscriptionEventCallbacks(message_lost=self._on_lost)
             self.subscribe(message, f"~/sources/{name}/tracks", self._reader(k, kind), depth, event_callbacks=lost)
         self.create_timer(LOOK_PERIOD_S, self._on_timer)
-        backward = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
-        self._jump = self.get_clock().create_jump_callback(backward, post_callback=self._on_jump)
 
     def _on_lost(self, event: Any) -> None:
         self.reject(
@@ -138,18 +134,19 @@ class FusionCentreNode(ManagedNode):
         self._advance(max(now_ns, stamp_ns))
 
     def _on_timer(self) -> None:
-        if not self.active or self._held:
-            return
-        now = self.now_ns()
+        if self.active and self.released:
+            self._handle(self._look_at, self.now_ns())
+
+    def _look_at(self, now: int) -> None:
+        """Fuse what has waited long enough; when all sources are silent, let the tracks coast."""
         self._advance(now)
         idle = now - self.buffer.fused_ns >= self._buffer_params.source_timeout_s * 1e9
         if idle and len(self.centre.tracks) and self.buffer.all_silent(now):
             self.buffer.fused_ns = now
             self._step(now, {})
 
-    def _on_jump(self, jump: Any) -> None:
-        self.log.warning("The clock has jumped back: forgetting all tracks and waiting scans.")
-        self.counted["clock_jumps"] += 1
+    def on_clock_jump(self) -> None:
+        """Forget all tracks and waiting scans."""
         self.buffer.reset()
         self.centre.reset()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import signal
 import sys
 import time
 import traceback
@@ -14,8 +15,9 @@ from typing import Any
 import rclpy
 import rclpy.utilities
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.clock import Clock
+from rclpy.clock import Clock, JumpThreshold
 from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
@@ -28,8 +30,10 @@ from track_fusion.nodes.ros_params import declare, refuse_unknown
 from track_fusion.params import ParameterError, Params, param
 
 DIAGNOSTICS_PERIOD_S = 1.0
-#: How often a held-back message looks whether the subscribers are there.
+#: How often a held-back message looks whether the clock and the subscribers are there.
 LOOK_PERIOD_S = 0.02
+#: So many messages are held back at most; later ones are rejected.
+MAX_HELD = 10_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +67,7 @@ class ManagedNode(LifecycleNode):
     """A lifecycle node whose subclasses declare parameters, connect topics and handle messages.
 
     Subclasses define `declare_parameters_` (all of them), `connect` (on configure) and may define
-    `on_start`, `diagnose` and `close`.
+    `on_start`, `on_stop`, `on_clock_jump`, `diagnose` and `close`.
     """
 
     def __init__(self, name: str, **kwargs: Any) -> None:
@@ -72,14 +76,19 @@ class ManagedNode(LifecycleNode):
         self.rejected: Counter[str] = Counter()
         self.counted: Counter[str] = Counter()
         self.active = False
+        self.released = False
+        self._error: Exception | None = None
         self.outputs: list[tuple[Any, int]] = []
         self._held: deque[tuple[Callable[[Any], None], Any]] = deque()
+        self._look: Any = None
         self._wall = Clock(clock_type=ClockType.STEADY_TIME)
         self.managed = declare(self, ManagedParams)
         self.declare_parameters_()
         refuse_unknown(self)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos(10))
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._publish_diagnostics, clock=self._wall)
+        backward = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
+        self._jump = self.get_clock().create_jump_callback(backward, post_callback=self._on_jump)
         if self.managed.autostart:
             self.autostart()
 
@@ -93,6 +102,12 @@ class ManagedNode(LifecycleNode):
 
     def on_start(self) -> None:
         """Begin, after activation."""
+
+    def on_clock_jump(self) -> None:
+        """Forget what belongs to another time: the clock has jumped back."""
+
+    def on_stop(self) -> None:
+        """Drop what waits, at deactivation."""
 
     def diagnose(self) -> tuple[list[str], dict[str, Any]]:
         """Return warnings and values to report."""
@@ -108,12 +123,13 @@ class ManagedNode(LifecycleNode):
 
         Raises
         ------
-        Fault    a transition failed (its error is in the log)
+        Fault             a transition failed (an unforeseen error is in the log)
+        ParameterError    it failed because a value is wrong
         """
         transitions: list[Callable[[], Any]] = [self.trigger_configure, self.trigger_activate]
         for transition in transitions:
             if transition() != TransitionCallbackReturn.SUCCESS:
-                raise Fault(f"{self.get_name()} could not start.")
+                raise self._error or Fault(f"{self.get_name()} could not start.")
 
     def on_configure(self, state: Any) -> Any:
         """Connect topics."""
@@ -130,14 +146,30 @@ class ManagedNode(LifecycleNode):
 
     def on_deactivate(self, state: Any) -> Any:
         """Stop processing; what arrives from now on is ignored."""
-        self.active = False
-        self._held.clear()
+        self._stop()
         return super().on_deactivate(state)
+
+    def on_shutdown(self, state: Any) -> Any:
+        """Stop processing for good."""
+        self._stop()
+        return super().on_shutdown(state)
+
+    def _stop(self) -> None:
+        self.active = self.released = False
+        self._held.clear()
+        if self._look is not None:
+            self._look.cancel()
+        self.on_stop()
 
     def _guarded(self, action: Callable[[], None]) -> Any:
         """Run a transition's work; rclpy would swallow its error, so log it and fail."""
         try:
             action()
+        except (Fault, ParameterError) as error:
+            self._error = error
+            if not self.managed.autostart:  # else the process ends with it
+                self.log.error(str(error))
+            return TransitionCallbackReturn.FAILURE
         except Exception as error:
             self.log.error(f"{error}\n{traceback.format_exc()}")
             return TransitionCallbackReturn.FAILURE
@@ -145,7 +177,8 @@ class ManagedNode(LifecycleNode):
 
     def _start(self) -> None:
         self._began = time.monotonic()
-        if any(self._missing(pub, count) for pub, count in self.outputs):
+        self.released = not self._awaited()
+        if not self.released:
             self._look = self.create_timer(LOOK_PERIOD_S, self._release, clock=self._wall)
         self.on_start()
 
@@ -165,10 +198,12 @@ class ManagedNode(LifecycleNode):
         def guarded(msg: Any) -> None:
             if not self.active:
                 return
-            if self._held or any(self._missing(pub, count) for pub, count in self.outputs):
+            if self.released:
+                self._handle(handle, msg)
+            elif len(self._held) < MAX_HELD:
                 self._held.append((handle, msg))
-                return
-            self._handle(handle, msg)
+            else:
+                self.reject({"held_too_long": 1}, f"{MAX_HELD} messages wait for {self._awaited()}")
 
         return self.create_subscription(
             kind, topic, guarded, qos(depth),
@@ -185,14 +220,23 @@ class ManagedNode(LifecycleNode):
         except Exception as error:  # a fault of ours must not stop the robot: tell it loudly and go on
             self.reject({"internal_error": 1}, f"{error}\n{traceback.format_exc()}")
 
+    def _awaited(self) -> str:
+        """Say what input is held back for; empty: nothing.
+
+        Before simulated time has begun no stamp can be judged: the first messages may overtake the first /clock.
+        """
+        if self.now_ns() == 0:
+            return "/clock"
+        return ", ".join(f"subscribers of {pub.topic_name}" for pub, count in self.outputs if self._missing(pub, count))
+
     def _missing(self, pub: Any, expected: int) -> bool:
         if expected == 0 or pub.get_subscription_count() >= expected:
             return False
         return time.monotonic() - self._began < self.managed.subscribers_deadline_s
 
     def _release(self) -> None:
-        """Hand on what was held back once all subscribers are there, or the deadline has passed."""
-        if any(self._missing(pub, count) for pub, count in self.outputs):
+        """Hand on what was held back, once the clock runs and all subscribers are there or too late."""
+        if self._awaited():
             return
         self._look.cancel()
         for pub, count in self.outputs:
@@ -201,12 +245,17 @@ class ManagedNode(LifecycleNode):
                 self.log.warning(f"{pub.topic_name} has {have} of {count} expected subscribers; going on.")
         # No message is lost silently, however many waited here.
         self.outputs = [(pub, 0) for pub, _ in self.outputs]
-        self.on_released()
+        self.released = True
         while self._held:
             self._handle(*self._held.popleft())
 
-    def on_released(self) -> None:
-        """Begin what needed the subscribers."""
+    # Time.
+
+    def _on_jump(self, jump: Any) -> None:
+        self.log.warning("The clock has jumped back: starting anew.")
+        self.counted["clock_jumps"] += 1
+        self._held.clear()
+        self.on_clock_jump()
 
     # Rejections and diagnostics.
 
@@ -223,6 +272,8 @@ class ManagedNode(LifecycleNode):
 
     def _publish_diagnostics(self) -> None:
         warnings, values = self.diagnose()
+        if self.active and not self.released:
+            warnings.append(f"{len(self._held)} messages wait for {self._awaited()}")
         warnings += [f"{sum(self.rejected.values())} rejected"] if self.rejected else []
         level = DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
         shown = {"active": self.active, **values, **self.counted}
@@ -254,6 +305,10 @@ def run(make: Callable[[], ManagedNode]) -> int:
         return _failed(str(error), 2)
     except Fault as error:
         return _failed(str(error), 1)
+    except Exception:
+        if rclpy.utilities.ok():
+            raise
+        # A signal came while the node was being built: what it built upon is gone.
     finally:
         _close(node)
     return 0
@@ -265,6 +320,7 @@ def _failed(text: str, code: int) -> int:
 
 
 def _close(node: ManagedNode | None) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ending already; a second Ctrl-C shall not lose the result
     try:
         if node is not None:
             node.close()

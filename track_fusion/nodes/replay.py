@@ -7,6 +7,7 @@ import time
 from typing import Any
 
 import numpy as np
+import rclpy.utilities
 from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
 from rosgraph_msgs.msg import Clock as ClockMessage
@@ -44,7 +45,7 @@ class ReplayParams(Params):
     bag: str = param("", "a rosbag2 directory to play instead of a scenario")
     seed: int = param(0, "seed of the random streams", low=0)
     run: int = param(0, "index of the Monte Carlo run", low=0)
-    steps: int = param(0, "replay so many steps of the scenario; 0: all", low=0)
+    steps: int = param(0, "replay so many steps, also beyond the scenario's own number; 0: that number", low=0)
     sensors: tuple[str, ...] = param((), "sensors of the scenario to publish; empty: all", kind=str)
     frame_id: str = param("map", "frame of what the scenario publishes")
     pace: str = param(
@@ -102,9 +103,9 @@ class ReplayNode(ManagedNode):
         for name in names:
             if name not in tracking.sensors:
                 raise unknown_name_error(name, tracking.sensors, "sensor")
-        self._states = tracking.truth(self.params.seed, self.params.run)
+        self._steps = self.params.steps or tracking.steps
+        self._states = tracking.truth(self.params.seed, self.params.run, self._steps)
         self._drawn = tracking.measurements(self._states, self.params.seed, self.params.run)
-        self._steps = min(self.params.steps or tracking.steps, tracking.steps)
         self._truth = self.publisher(Odometry, "~/truth", depth=100)
         self._detections = {name: self.publisher(PointCloud2, f"~/{name}/detections") for name in names}
         self._wanted = dict.fromkeys(self._detections.values(), self.params.expected_subscribers_each)
@@ -125,6 +126,8 @@ class ReplayNode(ManagedNode):
             self._began = time.monotonic()
             self._next()
         elif self.params.pace == "lockstep" and not self.params.bag:
+            if not self.counted["results"]:  # a participant may have met our clock after our first message
+                self._tell_time()
             self._check_deadline(f"no result of step {self._step} on {self._fused.topic_name}. {self._network()}")
 
     def _check_deadline(self, what: str) -> None:
@@ -162,9 +165,15 @@ class ReplayNode(ManagedNode):
                 period = self._tracking.dt_s / self.params.rate
                 self._pacer = self.create_timer(period, self._next, clock=self._wall)
 
+    def _stamp_ns(self) -> int:
+        return round(self._step * self._tracking.dt_s * SECOND_NS)
+
+    def _tell_time(self) -> None:
+        self._clock_out.publish(ClockMessage(clock=stamp_from_ns(self._stamp_ns())))
+
     def _publish_step(self, step: int) -> None:
-        stamp_ns = round(step * self._tracking.dt_s * SECOND_NS)
-        self._clock_out.publish(ClockMessage(clock=stamp_from_ns(stamp_ns)))
+        stamp_ns = self._stamp_ns()
+        self._tell_time()
         layout = self._tracking.motion.layout
         truth = TrackBatch.gaussian(
             layout, self.params.frame_id, self._states[step][None], TRUTH_VARIANCE * np.eye(layout.size)[None],
@@ -181,7 +190,7 @@ class ReplayNode(ManagedNode):
 
     def _on_fused(self, msg: Any) -> None:
         stamp_ns = msg.header.stamp.sec * SECOND_NS + msg.header.stamp.nanosec
-        if self._started and stamp_ns == round(self._step * self._tracking.dt_s * SECOND_NS):
+        if self._started and stamp_ns == self._stamp_ns():
             self.counted["results"] += 1
             self._next()
 
@@ -195,7 +204,7 @@ class ReplayNode(ManagedNode):
 
     def close(self) -> None:
         """Let reliable readers take the last messages before the writer is gone."""
-        for pub in self._wanted if hasattr(self, "_wanted") else ():
+        for pub in self._wanted if self.finished and rclpy.utilities.ok() else ():
             pub.wait_for_all_acked(Duration(seconds=ACK_DEADLINE_S))
 
     def diagnose(self) -> tuple[list[str], dict[str, Any]]:

@@ -66,6 +66,16 @@ class SensorTrackerNode(ManagedNode):
             self.subscribe(PointCloud2, "~/feedback", self._on_feedback)
             self.create_timer(LOOK_PERIOD_S, self._on_deadline, clock=self._wall)
 
+    def on_clock_jump(self) -> None:
+        """Go back to the initial state."""
+        self.on_stop()
+        self.tracker.reset()
+
+    def on_stop(self) -> None:
+        """Drop waiting scans."""
+        self._queue.clear()
+        self._awaited_ns = -1
+
     def _on_detections(self, msg: Any) -> None:
         now = self.now_ns()
         check_header(msg.header, frame_id=self.frame.frame_id, now_ns=now, max_future_ns=self.frame.max_future_ns)

@@ -39,13 +39,17 @@ class Tracking:
     initial_cov: Array
     sensors: Mapping[str, LinearSensor]
 
-    def truth(self, seed: int, run: int) -> Array:
-        """Draw the target's states at steps 0 to T, (T + 1, n); step 0 is the initial mean itself."""
+    def truth(self, seed: int, run: int, steps: int | None = None) -> Array:
+        """Draw the target's states at steps 0 to T, (T + 1, n); step 0 is the initial mean itself.
+
+        T is `steps`, the scenario's own number by default; the first states do not depend on it.
+        """
+        steps = self.steps if steps is None else steps
         transition, factor = self.motion.matrices(self.dt_s)[0], self.motion.noise_factor(self.dt_s)
-        draws = stream(seed, run, "truth").standard_normal((self.steps, factor.shape[1]))
-        states = np.empty((self.steps + 1, len(self.initial_mean)))
+        draws = stream(seed, run, "truth").standard_normal((steps, factor.shape[1]))
+        states = np.empty((steps + 1, len(self.initial_mean)))
         states[0] = self.initial_mean
-        for k in range(self.steps):
+        for k in range(steps):
             states[k + 1] = transition @ states[k] + factor @ draws[k]
         return states
 
@@ -54,7 +58,7 @@ class Tracking:
         found = {}
         for name, sensor in self.sensors.items():
             factor = np.linalg.cholesky(sensor.noise)
-            draws = stream(seed, run, name).standard_normal((self.steps, len(factor)))
+            draws = stream(seed, run, name).standard_normal((len(truth) - 1, len(factor)))
             found[name] = truth[1:] @ sensor.matrix.T + draws @ factor.T
         return found
 
