@@ -73,7 +73,7 @@ def check_python(sourced):
     names = ["python3.%d" % minor for minor in range(NEWEST_WHEEL[1], OLDEST[1] - 1, -1)]
     usable = [name for name in names if works(name)]
     advice = "run make again with PYTHON=%s." % usable[0] if usable else "install one (with venv) and set PYTHON=."
-    raise Refusal("track_fusion needs Python %s; this is %s: %s" % (allowed, platform.python_version(), advice))
+    raise Refusal("Python %s is needed; this is %s: %s" % (allowed, platform.python_version(), advice))
 
 
 def works(name):
@@ -117,7 +117,8 @@ def create(folder, sourced):
     command = [python, "-m", "venv", "--clear"] + (["--system-site-packages"] if sourced else []) + [folder]
     if subprocess.call(command, env=clean_environment()) != 0:
         raise Refusal("Could not make the environment %s (the lines above say why)." % folder)
-    if sourced and subprocess.call([os.path.join(folder, "bin", "python"), "-c", "import rclpy"]) != 0:
+    check = [os.path.join(folder, "bin", "python"), "-c", "import rclpy"]
+    if sourced and subprocess.call(check, stderr=subprocess.DEVNULL) != 0:
         shutil.rmtree(folder)
         raise Refusal(
             "ROS 2 is sourced (%s), but %s cannot import its rclpy: set PYTHON to the Python that ROS was built "

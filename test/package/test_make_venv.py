@@ -55,7 +55,7 @@ def test_supported_pythons_are_accepted(make_venv: ModuleType, monkeypatch: pyte
 @pytest.mark.parametrize("minor", [6, 10, 14])
 def test_another_python_is_refused(make_venv: ModuleType, monkeypatch: pytest.MonkeyPatch, minor: int) -> None:
     pretend_python(monkeypatch, 3, minor)
-    assert f"needs Python 3.11 to 3.13; this is 3.{minor}.1: " in refusal(make_venv, [])
+    assert f"Python 3.11 to 3.13 is needed; this is 3.{minor}.1: " in refusal(make_venv, [])
 
 
 def test_a_python_at_hand_that_would_do_is_named(
