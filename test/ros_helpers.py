@@ -8,6 +8,7 @@ with NodeProcess("fusion_centre", params={"rule": "naive"}) as centre, Probe(ros
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 import subprocess
@@ -15,7 +16,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,32 @@ _pause = threading.Event().wait
 LAUNCHER = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.execv(sys.argv[1], sys.argv[1:])"
 # Set by the ROS wheels' start-up hook; another environment's Python must find its own libraries.
 WHEEL_VARIABLES = ("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "LD_LIBRARY_PATH")
+
+
+_next_domain = os.getpid() * 7  # suites that start one after the other begin in different places
+
+
+@contextmanager
+def own_domain(domains: Sequence[int]) -> Iterator[int]:
+    """Claim a ROS domain that no other test on this machine uses meanwhile."""
+    global _next_domain
+    for _ in domains:
+        domain = domains[_next_domain % len(domains)]
+        _next_domain += 1
+        # A lock on an open file ends with the process, however it ends.
+        path = Path(tempfile.gettempdir()) / f"track_fusion_{os.getuid()}_domain_{domain}.lock"
+        lock = os.open(path, os.O_CREAT | os.O_RDWR, 0o600)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(lock)
+            continue
+        try:
+            yield domain
+        finally:
+            os.close(lock)
+        return
+    raise RuntimeError("Every ROS domain is in use by other tests on this machine.")
 
 
 class NodeProcess:
