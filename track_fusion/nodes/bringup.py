@@ -68,9 +68,13 @@ class Nodes:
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(self, executable: str, name: str, arguments: Sequence[str]) -> None:
-        """Start a node; it dies with this process."""
+        """Start a node of this package; it dies with this process."""
+        self.start_module(f"track_fusion.nodes.{executable}", name, arguments)
+
+    def start_module(self, module: str, name: str, arguments: Sequence[str]) -> None:
+        """Start any module as a node; it dies with this process."""
         self.processes[name] = subprocess.Popen(
-            [sys.executable, "-m", f"track_fusion.nodes.{executable}", *arguments],
+            [sys.executable, "-m", module, *arguments],
             env=self._environment, stdin=subprocess.DEVNULL, stdout=self._log, stderr=subprocess.STDOUT,
             preexec_fn=_die_with_parent,
         )  # fmt: skip
@@ -104,7 +108,13 @@ def running(environment: Mapping[str, str], log_path: Path) -> Iterator[Nodes]:
             nodes.stop()
 
 
-def start_scenario(nodes: Nodes, scenario: str, rule: str | None, overrides: Mapping[str, Mapping[str, Any]]) -> None:
+def start_scenario(
+    nodes: Nodes,
+    scenario: str,
+    rule: str | None,
+    overrides: Mapping[str, Mapping[str, Any]],
+    evaluator: bool = True,
+) -> None:
     """Start replay, trackers, centre and evaluator of a scenario, wired as launch/scenario.launch.py does.
 
     Parameters
@@ -113,6 +123,7 @@ def start_scenario(nodes: Nodes, scenario: str, rule: str | None, overrides: Map
     scenario : str                           its parameter file is config/<scenario>.yaml
     rule : str or None                       fusion rule; None = no fusion: the first sensor's tracker alone
     overrides : {node: {parameter: value}}   on top of the file
+    evaluator : bool                         whether to start that one, too
     """
     from track_fusion.scenarios import get_scenario
 
@@ -131,5 +142,6 @@ def start_scenario(nodes: Nodes, scenario: str, rule: str | None, overrides: Map
     if rule:
         sources = {f"~/sources/{s}/tracks": f"/{s}/tracks" for s in sensors}
         start("fusion_centre", "fusion_centre", {"state_fusion": rule}, sources)
-    start("evaluator", "evaluator", {"steps": tracking.steps}, {"~/truth": "/replay/truth", "~/tracks": fused})
+    if evaluator:
+        start("evaluator", "evaluator", {"steps": tracking.steps}, {"~/truth": "/replay/truth", "~/tracks": fused})
     start("replay", "replay", {"sensors": sensors}, {"~/fused": fused})
