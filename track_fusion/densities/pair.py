@@ -42,13 +42,21 @@ class Pair:
         lower = np.linalg.cholesky(p1 + p2)
         whiten = np.linalg.inv(lower)
         first, vectors = np.linalg.eigh(symmetrise(whiten @ p1 @ transpose(whiten)))
+        first[(p1 == p2).all((-2, -1))] = 0.5
         first = np.ascontiguousarray(first.T)
         inverse = transpose(vectors) @ whiten
         second = 1.0 - first
-        if first.size and (first.min() < SHARP or first.max() > 1.0 - SHARP):
+        sharp = np.flatnonzero((first < SHARP).any(0) | (second < SHARP).any(0))
+        if len(sharp):
             # Subtracting from one would lose the digits of a very sharp axis: measure it.
-            first, second = _measured(inverse, p1), _measured(inverse, p2)
+            first[:, sharp], second[:, sharp] = (_measured(inverse[sharp], p[sharp]) for p in (p1, p2))
         return cls(lower @ vectors, inverse, first, second)
+
+    @property
+    def contrast(self) -> Array:
+        """Second - first, (n, B), and zero where rounding alone tells them apart."""
+        difference = self.second - self.first
+        return np.asarray(np.where(np.abs(difference) < EQUAL, 0.0, difference))
 
     def rebuild(self, diagonal: Array) -> Array:
         """Return T diag(d) T' for d of shape (n, B)."""
@@ -65,6 +73,10 @@ class Pair:
 
 #: Below this share of P1 + P2, 1 - share has lost half its digits.
 SHARP = 1e-8
+#: Shares of P1 + P2 that differ by less are equal but for rounding, which must not decide on a weight.
+EQUAL = 1e-12
+#: Up to so many pairs, plain numbers (`SinglePair`) are faster than arrays (`Pair`).
+FEW = 8
 
 
 def _measured(inverse: Array, cov: Array) -> Array:
@@ -97,14 +109,25 @@ class SinglePair:
         ------
         LinAlgError    P1 + P2 is not positive definite
         """
-        total = p1 + p2
-        shares, vectors, failed = lapack.dsygv(p1, total)
+        lower, failed = lapack.dpotrf(p1 + p2, lower=1)
         if failed:
             raise np.linalg.LinAlgError("P1 + P2 of a pair of covariances is not positive definite")
+        whiten = lapack.dtrtri(lower, lower=1)[0]
+        shares, vectors, failed = lapack.dsyevd(whiten @ p1 @ whiten.T)
+        if failed:
+            raise np.linalg.LinAlgError("The eigenvalues of a pair of covariances did not converge")
+        if (p1 == p2).all():
+            shares[:] = 0.5
         first = tuple(shares.tolist())
         if first[0] < SHARP or first[-1] > 1.0 - SHARP:
             return None
-        return cls(total @ vectors, vectors.T, first, tuple((1.0 - shares).tolist()))
+        return cls(lower @ vectors, vectors.T @ whiten, first, tuple((1.0 - shares).tolist()))
+
+    @property
+    def contrast(self) -> list[float]:
+        """Second - first, and zero where rounding alone tells them apart."""
+        differences = [q - p for p, q in zip(self.first, self.second, strict=True)]
+        return [d if abs(d) >= EQUAL else 0.0 for d in differences]
 
     def rebuild(self, diagonal: Sequence[float]) -> Array:
         """Return T diag(d) T'."""

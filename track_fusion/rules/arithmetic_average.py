@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.gaussian import merge
-from track_fusion.densities.pair import Pair
+from track_fusion.densities.pair import FEW, Pair, SinglePair
 from track_fusion.linalg import Array, logdet, transpose
-from track_fusion.optimise import Derivatives, GradientHessian, Solution, minimise_on_interval, minimise_on_simplex
+from track_fusion.optimise import (
+    Derivatives,
+    GradientHessian,
+    Solution,
+    minimise_on_interval,
+    minimise_on_simplex,
+    minimise_one,
+)
 from track_fusion.params import Params, param
 from track_fusion.rules.base import FusedTracks, Mixture, Rule, SourceTracks, check_weights
+
+T = TypeVar("T", float, Array)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,10 +108,12 @@ def diversity_weights(mean: Array, cov: Array) -> Solution:
     -------
     Solution    weights (B, K); uniform where all tracks are equal
     """
-    if mean.shape[1] == 2:
-        found = minimise_on_interval(_pair_derivatives(mean, cov), len(mean))
-        return Solution(np.stack([found.weights, 1.0 - found.weights], -1), found.converged, found.iterations)
-    return minimise_on_simplex(_gradient_hessian(mean, cov), len(mean), mean.shape[1])
+    if mean.shape[1] > 2:
+        return minimise_on_simplex(_gradient_hessian(mean, cov), len(mean), mean.shape[1])
+    if 0 < len(mean) <= FEW:
+        return Solution.concatenate([_single_weights(m, c) for m, c in zip(mean, cov, strict=True)])
+    found = minimise_on_interval(_pair_derivatives(mean, cov), len(mean))
+    return Solution(np.stack([found.weights, 1.0 - found.weights], -1), found.converged, found.iterations)
 
 
 def _pair_derivatives(mean: Array, cov: Array) -> Derivatives:
@@ -110,24 +123,53 @@ def _pair_derivatives(mean: Array, cov: Array) -> Derivatives:
     1 + w (1 - w) q with q = e' D^-1 e.
     """
     pair = Pair.of(cov[:, 0], cov[:, 1])
-    first, second = pair.first, pair.second
+    second, change = pair.second, -pair.contrast
     square = pair.coordinates(mean[:, 0] - mean[:, 1]) ** 2
-    entropy = np.log(first).sum(0) - np.log(second).sum(0)
+    entropy = np.where(change == 0.0, 0.0, np.log(pair.first) - np.log(second)).sum(0)
 
     def derivatives(w: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
-        whole = len(rows) == first.shape[1]
-        p1, p2, e2 = (first, second, square) if whole else (first[:, rows], second[:, rows], square[:, rows])
-        change = p1 - p2
-        d = p2 + w * change
-        rate = change / d
-        share = e2 / d
-        q, dq, ddq = share.sum(0), -(share * rate).sum(0), 2.0 * (share * rate**2).sum(0)
-        v, dv = w * (1.0 - w), 1.0 - 2.0 * w
-        psi, dpsi, ddpsi = 1.0 + v * q, dv * q + v * dq, -2.0 * q + 2.0 * dv * dq + v * ddq
-        slope = (entropy if whole else entropy[rows]) - rate.sum(0) - dpsi / psi
-        return slope, (rate**2).sum(0) - ddpsi / psi + (dpsi / psi) ** 2
+        whole = len(rows) == second.shape[1]
+        p2, c, e2 = (second, change, square) if whole else (second[:, rows], change[:, rows], square[:, rows])
+        d = p2 + w * c
+        rate, share = c / d, e2 / d
+        fall = share * rate
+        slope, curvature = _join(w, rate.sum(0), (rate * rate).sum(0), share.sum(0), fall.sum(0), (fall * rate).sum(0))
+        return (entropy if whole else entropy[rows]) + slope, curvature
 
     return derivatives
+
+
+def _single_weights(mean: Array, cov: Array) -> Solution:
+    """Find the weights of one pair, mean (2, n), as a batch of one; in plain numbers where no axis is very sharp."""
+    pair = SinglePair.of(cov[0], cov[1])
+    if pair is None:
+        found = minimise_on_interval(_pair_derivatives(mean[None], cov[None]), 1)
+        return Solution(np.stack([found.weights, 1.0 - found.weights], -1), found.converged, found.iterations)
+    square = ((pair.inverse @ (mean[0] - mean[1])) ** 2).tolist()
+    axes = [(q, -c, e) for q, c, e in zip(pair.second, pair.contrast, square, strict=True)]
+    entropy = sum(math.log((q + c) / q) for q, c, _ in axes)
+
+    def derivatives(w: float) -> tuple[float, float]:
+        a = b = q = r = s = 0.0
+        for p2, c, e2 in axes:
+            d = p2 + w * c
+            rate, share = c / d, e2 / d
+            fall = share * rate
+            a, b, q, r, s = a + rate, b + rate * rate, q + share, r + fall, s + fall * rate
+        slope, curvature = _join(w, a, b, q, r, s)
+        return entropy + slope, curvature
+
+    omega, converged, iterations = minimise_one(derivatives)
+    return Solution(np.array([[omega, 1.0 - omega]]), np.array([converged]), np.array([iterations]))
+
+
+def _join(w: T, rate: T, square: T, q: T, fall: T, fall_rate: T) -> tuple[T, T]:
+    """Derivatives of -log det D - log(1 + w (1 - w) q) from sums over axes; those of q are -fall and 2 fall_rate."""
+    v, dv = w * (1.0 - w), 1.0 - 2.0 * w
+    psi = 1.0 + v * q
+    rise = (dv * q - v * fall) / psi
+    bend = (2.0 * v * fall_rate - 2.0 * q - 2.0 * dv * fall) / psi
+    return -rate - rise, square - bend + rise * rise
 
 
 def _gradient_hessian(mean: Array, cov: Array) -> GradientHessian:

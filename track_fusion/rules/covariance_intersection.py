@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.gaussian import keep_sole, weighted_product
-from track_fusion.densities.pair import SHARP, Pair, SinglePair
+from track_fusion.densities.pair import FEW, SHARP, Pair, SinglePair
 from track_fusion.linalg import Array, inverse, matvec, outer, symmetrise, transpose
 from track_fusion.optimise import (
     Derivatives,
@@ -23,8 +23,6 @@ from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weigh
 
 #: Large batches are worked on in pieces whose arrays stay in the cache.
 PAIR_CHUNK, MANY_CHUNK = 1024, 512
-#: Up to so many pairs, plain numbers are faster than arrays.
-FEW = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,7 +156,7 @@ NEAR_END = 1e-6
 
 def _single_derivatives(pair: SinglePair, criterion: str) -> ScalarDerivatives:
     """`_pair_derivatives` of one pair in plain numbers."""
-    slopes = [q - p for p, q in zip(pair.first, pair.second, strict=True)]
+    slopes = pair.contrast
     if criterion == "det":
         axes = list(zip(pair.first, slopes, strict=True))
 
@@ -189,7 +187,7 @@ def _single_derivatives(pair: SinglePair, criterion: str) -> ScalarDerivatives:
 
 def _pair_derivatives(pair: Pair, criterion: str) -> Derivatives:
     """Derivatives over the weight of P1 of log det P, or of tr P, of diagonal pairs."""
-    slope_of = pair.second - pair.first
+    slope_of = pair.contrast
     if criterion == "trace":
         length = np.ascontiguousarray((pair.basis**2).sum(-2).T) * pair.first * pair.second
 
