@@ -6,6 +6,7 @@ rclpy, the message packages, NumPy and SciPy.
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import sys
@@ -13,6 +14,7 @@ import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 from package import launch_stand_in
@@ -24,16 +26,13 @@ ROOT = Path(__file__).resolve().parents[2]
 PYTHON = os.environ.get("TRACK_FUSION_NODE_PYTHON", sys.executable)
 NODES = ["replay", "sensor_1", "sensor_2", "fusion_centre", "evaluator"]
 SCENARIO_DEADLINE_S = 60.0  # the scenario's steps in lockstep take about one second
+STEPS = 100  # of li2022-linear
 
 
-@pytest.fixture(autouse=True)
-def _temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-
-
-def nodes_of(launch: str, **arguments: str) -> dict[str, launch_stand_in.Described]:
+def nodes_of(folder: Path, launch: str, **arguments: str) -> dict[str, launch_stand_in.Described]:
     """Return the nodes of a launch file by name, in the order in which they are started."""
-    nodes = launch_stand_in.load(ROOT / "launch" / f"{launch}.launch.py", ROOT, **arguments).nodes
+    with mock.patch.object(tempfile, "tempdir", str(folder)):  # where a launch file leaves parameter files
+        nodes = launch_stand_in.load(ROOT / "launch" / f"{launch}.launch.py", ROOT, **arguments).nodes
     return {node.name: node for node in nodes}
 
 
@@ -55,8 +54,8 @@ def topics_of(probe: Probe, name: str) -> set[str]:
 
 @pytest.mark.parametrize("name", NODES)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
-def test_a_node_starts_has_its_topics_and_ends(name: str, number: int, ros_context: Any) -> None:
-    node = nodes_of("demo")[name]
+def test_a_node_starts_has_its_topics_and_ends(name: str, number: int, ros_context: Any, tmp_path: Path) -> None:
+    node = nodes_of(tmp_path, "demo")[name]
     with start(node) as process, Probe(ros_context) as probe:
         probe.wait_for_state(f"/{name}", "active")
         wanted = set(node.remappings.values())
@@ -65,18 +64,20 @@ def test_a_node_starts_has_its_topics_and_ends(name: str, number: int, ros_conte
         assert process.stop(number) == 0, process.output()
 
 
-def test_launch_arguments_override_the_parameter_file(ros_context: Any) -> None:
-    node = nodes_of("scenario", rule="naive")["fusion_centre"]
+def test_launch_arguments_override_the_parameter_file(ros_context: Any, tmp_path: Path) -> None:
+    node = nodes_of(tmp_path, "scenario", rule="naive")["fusion_centre"]
     with start(node), Probe(ros_context) as probe:
         request = GetParameters.Request(names=["state_fusion"])
         values = probe.call("/fusion_centre/get_parameters", GetParameters, request).values
         assert [value.string_value for value in values] == ["naive"]
 
 
-def test_the_demo_launch_runs_to_its_end(ros_domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_demo_launch_runs_to_its_end(ros_domain: int, tmp_path: Path) -> None:
     with ExitStack() as stack:
-        running = {name: stack.enter_context(start(node)) for name, node in nodes_of("demo").items()}
+        running = {name: stack.enter_context(start(node)) for name, node in nodes_of(tmp_path, "demo").items()}
         assert running["replay"].wait(SCENARIO_DEADLINE_S) == 0
         for name, process in running.items():
             assert process.stop() == 0, f"{name}: {process.output()}"
+        printed = running["evaluator"].output()
+        result = json.loads(printed[printed.index("{") :])  # a warning may come first
+    assert (result["times"], result["missed"], result["false"]) == (STEPS, 0, 0)
