@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rules.examples import covariances
+from rules.examples import covariances, rotated
 from rules.oracles import Intersection, errors, mp
 from scipy.optimize import minimize, minimize_scalar
 
@@ -24,12 +24,6 @@ EPS = float(np.finfo(float).eps)
 
 def fuse(mean: Array, cov: Array, **params: Any) -> FusedTracks:
     return RULE(SourceTracks(mean, cov), CovarianceIntersectionParams(**params))
-
-
-def rotated(rng: np.random.Generator, eigenvalues: Array) -> Array:
-    basis = np.linalg.qr(rng.normal(size=(len(eigenvalues),) * 2))[0]
-    cov = (basis * eigenvalues) @ basis.T
-    return 0.5 * (cov + cov.T)
 
 
 def hard_pair(kind: str, condition: float, rng: np.random.Generator) -> Array:
