@@ -1,4 +1,4 @@
-"""The conservative fusion chains (13) and (19) of Li 2022, in trace and in the Loewner order where ERRATA.md says so."""
+"""The fusion chains (13) and (19) of Li 2022, in trace, and in the Loewner order where ERRATA.md says so."""
 
 from __future__ import annotations
 
