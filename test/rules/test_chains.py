@@ -38,7 +38,8 @@ def test_chain_13_in_trace(tracks: tuple[Array, Array]) -> None:
     """Naive < min P <= CU min <= AA <= CU max."""
     mean, cov = tracks
     chain = [
-        trace(fused("naive", mean, cov)), trace(cov).min(1), trace(fused("covariance_union", mean, cov, bound="min_trace")),
+        trace(fused("naive", mean, cov)), trace(cov).min(1),
+        trace(fused("covariance_union", mean, cov, bound="min_trace")),
         trace(fused("arithmetic_average", mean, cov, criterion="uniform")),
         trace(fused("covariance_union", mean, cov, bound="max_trace")),
         trace(fused("covariance_union", mean, cov, criterion="trace")),
