@@ -262,7 +262,9 @@ class ManagedNode(LifecycleNode):
     def reject(self, reasons: dict[str, int] | Counter[str], text: str = "") -> None:
         """Count rejected messages or tracks by reason, and log the first of each kind."""
         for reason, count in reasons.items():
-            if count and not self.rejected[reason]:
+            if not count:
+                continue
+            if not self.rejected[reason]:
                 self.log.warning(f"Rejected ({reason}): {text or 'see /diagnostics for the count'}")
             self.rejected[reason] += count
 
