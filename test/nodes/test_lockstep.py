@@ -158,10 +158,10 @@ def library(rule: str | None) -> NDArray[np.float64]:
     drawn = tracking.measurements(truth, SEED, RUN)
     seen = [drawn[name][None] for name in tracking.sensors]
     if rule is None:
-        estimates = li2022_linear._one_filter(seen[:1], 1)
+        estimates = li2022_linear.one_filter(seen[:1])
     else:
         choice = next(c for c in get_scenario(SCENARIO).rules if c.name == rule)
-        estimates = li2022_linear._fused(choice, seen, 1)
+        estimates = li2022_linear.fused_filters(choice, seen)
     return np.array([mean[0] for mean in estimates])
 
 

@@ -67,8 +67,8 @@ def squared_errors(runs: Sequence[int], seed: int, progress: Callable[[float], N
     truth = TRACKING.truths(seed, runs)
     drawn = [TRACKING.measurements(states, seed, run) for states, run in zip(truth, runs, strict=True)]
     seen = [np.stack([d[name] for d in drawn]) for name in TRACKING.sensors]
-    rows = {"kf-alone": _one_filter(seen[:1]), "kf-ic": _one_filter(seen)}
-    rows |= {f"kf-{choice.name}": _fused(choice, seen) for choice in RULE_CHOICES}
+    rows = {"kf-alone": one_filter(seen[:1]), "kf-ic": one_filter(seen)}
+    rows |= {f"kf-{choice.name}": fused_filters(choice, seen) for choice in RULE_CHOICES}
     squares: dict[str, Array] = {}
     for done, (row, estimates) in enumerate(rows.items()):
         names = [f"{row}/{quantity}" for quantity in QUANTITIES]
@@ -86,7 +86,7 @@ def _start(runs: int) -> tuple[Array, Array]:
     return np.tile(TRACKING.initial_mean, (runs, 1)), TRACKING.initial_cov[None]
 
 
-def _one_filter(seen: list[Array]) -> Iterator[Array]:
+def one_filter(seen: list[Array]) -> Iterator[Array]:
     """One filter that uses the measurements of the given sensors, (R, T, m) each, jointly."""
     sensors = list(TRACKING.sensors.values())[: len(seen)]
     mean, cov = _start(len(seen[0]))
@@ -97,7 +97,7 @@ def _one_filter(seen: list[Array]) -> Iterator[Array]:
         yield mean
 
 
-def _fused(choice: RuleChoice, seen: list[Array]) -> Iterator[Array]:
+def fused_filters(choice: RuleChoice, seen: list[Array]) -> Iterator[Array]:
     """One filter a sensor, fused after each step, the fused posterior fed back to all of them."""
     rule, sensors = RULES[choice.key], list(TRACKING.sensors.values())
     mean, cov = _start(len(seen[0]))
