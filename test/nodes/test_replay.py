@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from nav_msgs.msg import Odometry
-from nodes.support import SECOND_NS, START_S, STEP_S, stamp_ns
+from nodes.support import SECOND_NS, START_S, STEP_S, deep, stamp_ns
 from ros_helpers import NodeProcess, Probe
 from rosbags.rosbag2 import Reader
 from rosgraph_msgs.msg import Clock
@@ -108,13 +108,15 @@ def test_a_bag_is_played_in_a_loop_until_told_to_end(ros_context: Any) -> None:
 
 def test_a_scenario_publishes_what_the_library_draws(ros_context: Any) -> None:
     """Also beyond the scenario's own 100 steps; at pace realtime nobody has to answer."""
-    seed, run, steps, rate = 11, 4, 120, 200.0
+    seed, run, steps, rate = 11, 4, 120, 100.0
     with ExitStack() as stack:
         probe = stack.enter_context(Probe(ros_context))
+        topics = ("sensor_1/detections", "sensor_2/detections", "truth")
         seen = {s: probe.listen(f"/replay/{s}/detections", PointCloud2, 1000) for s in ("sensor_1", "sensor_2")}
         true = probe.listen("/replay/truth", Odometry, 1000)
         params = {"pace": "realtime", "rate": rate, "seed": seed, "run": run, "steps": steps}
-        process = stack.enter_context(NodeProcess("replay", params=params | {"expected_truth_subscribers": 1}))
+        params |= {"expected_truth_subscribers": 1, **deep(*(f"/replay/{t}.publisher" for t in topics))}
+        process = stack.enter_context(NodeProcess("replay", params=params))
         probe.wait_for(lambda: min(map(len, (*seen.values(), true))) >= steps, START_S, "all steps")
         assert process.wait(STEP_S) == 0
         tracking = get_scenario("li2022-linear").tracking
