@@ -50,7 +50,7 @@ def _naive_copies() -> tuple[float, float]:
 
 
 def _diagonal_pair(key: str, ratio: float, values: Values, cross: Array) -> float:
-    """Fuse diag(1, r) and diag(r, 1); return the error variance over the claim, along (1, 1), at this cross-covariance."""
+    """Fuse diag(1, r) and diag(r, 1); return the error variance over the claim along (1, 1), given the cross one."""
     from track_fusion.rules import RULES
 
     rule, cov = RULES[key], np.stack([np.diag([1.0, ratio]), np.diag([ratio, 1.0])])
