@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from track_fusion.chi_square import chi_square_quantile
 from track_fusion.linalg import Array
 from track_fusion.metrics.consistency import Consistency, consistency, nees
 from track_fusion.params import Params, param
@@ -17,6 +18,9 @@ from track_fusion.tracks import StateLayout, TrackBatch
 
 #: Fewer samples than this prove nothing.
 MIN_SAMPLES = 10
+#: How often a consistent estimator may be called overconfident: seldom, since one looks again and again while samples
+#: come, and samples of one run are correlated.
+FALSE_ALARM = 1e-5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,9 +95,10 @@ class Evaluation:
         return consistency(np.array([s[-1] for s in self._samples()]), self._layout.size)
 
     def is_overconfident(self) -> bool:
-        """Tell whether errors are larger than the covariances say, on enough samples."""
+        """Tell whether errors are larger than the covariances say, on enough samples and beyond doubt."""
         found = self.consistency()
-        return found.samples >= MIN_SAMPLES and found.verdict == "overconfident"
+        terms = found.samples * found.axes
+        return found.samples >= MIN_SAMPLES and found.anees > chi_square_quantile(1.0 - FALSE_ALARM, terms) / terms
 
     def result(self) -> dict[str, Any]:
         """Everything as JSON-ready values: figures over all and for each target, unmatched tracks and targets."""
