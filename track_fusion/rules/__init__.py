@@ -10,12 +10,13 @@ from track_fusion.rules import (
     mhdp_explicit,
     mhdp_iterative,
     naive,
+    quasi_minimal_manhattan,
 )
 from track_fusion.rules.base import FusedTracks, Mixture, Rule, SourceTracks
 
 _MODULES = (
     naive, covariance_intersection, arithmetic_average,
-    mhdp_explicit, mhdp_iterative, geodesic_projection,
+    mhdp_explicit, mhdp_iterative, quasi_minimal_manhattan, geodesic_projection,
 )  # fmt: skip
 
 #: Every rule by its key: what `state_fusion` may be.

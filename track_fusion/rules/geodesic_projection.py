@@ -63,7 +63,7 @@ RULE = Rule(
     family="elliptical",
     arity="n_ary",
     guarantee="none",
-    caveat="weights follow the means: an error that most tracks share is believed and under-reported by a third",
+    caveat="weights follow the means: a rare large error that most tracks share exceeds what is claimed by 42 %",
     source="Chen 2022 (45), (49)-(50), section 5",
     cost="K n^3, about ten times",
 )

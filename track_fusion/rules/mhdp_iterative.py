@@ -47,7 +47,7 @@ def fuse(tracks: SourceTracks, params: MhdpIterativeParams) -> FusedTracks:
     LinAlgError    a covariance is singular
 
     Notes          No guarantee: if a random pair of three tracks of variance 1 shares an error of 10 in 1.5 % of all
-                   cases and all else is exact, the mean follows the pair, and the mean square error is 1.35
+                   cases and all else is exact, the mean follows the pair, and the mean square error is 1.36
                    times the covariance claimed. With criterion unsquared the mean is a weighted
                    median: two scalar tracks always give one of the two estimates. cov / kappa is the scatter
                    that a filter of the family takes back. Some ten K n^3 for the mean, some thirty for the scatter.
@@ -79,7 +79,7 @@ RULE = Rule(
     family="elliptical",
     arity="n_ary",
     guarantee="none",
-    caveat="weights follow the means: an error that most tracks share is believed and under-reported by a third",
+    caveat="weights follow the means: a rare large error that most tracks share exceeds what is claimed by 36 %",
     source="Chen 2022 (39)-(40), (45), (48), (58)",
     cost="K n^3, about forty times",
 )
