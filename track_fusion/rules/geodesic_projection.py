@@ -49,7 +49,7 @@ def fuse(tracks: SourceTracks, params: GeodesicProjectionParams) -> FusedTracks:
     batch = tracks.mean.shape[:-2]
     family, dof = family_of(tracks, params)
     found = nearest_mean_of(tracks, family.geodesic_pull * family.kappa, squared=True)
-    weights = found.weights.reshape(*batch, -1)
+    weights = found.weights.reshape(tracks.mean.shape[:-1])
     mean, cov = weighted_product(tracks.mean, tracks.cov, weights)
     info = {"converged": found.converged.reshape(batch), "iterations": found.iterations.reshape(batch)}
     return FusedTracks(mean, cov, weights, dof, info=info)

@@ -57,7 +57,7 @@ def fuse(tracks: SourceTracks, params: MhdpExplicitParams) -> FusedTracks:
         "snapped": found.snapped.reshape(batch),
     }
     cov = log_euclidean_mean(covs).reshape(*batch, n, n)
-    return FusedTracks(found.mean.reshape(*batch, n), cov, found.weights.reshape(*batch, -1), dof, info=info)
+    return FusedTracks(found.mean.reshape(*batch, n), cov, found.weights.reshape(tracks.mean.shape[:-1]), dof, info=info)
 
 
 RULE = Rule(

@@ -57,7 +57,7 @@ def fuse(tracks: SourceTracks, params: MhdpIterativeParams) -> FusedTracks:
     batch, n = tracks.mean.shape[:-2], tracks.mean.shape[-1]
     family, dof = family_of(tracks, params)
     found, covs = projected(tracks, family, params.criterion == "squared")
-    weights, converged = found.weights.reshape(*batch, -1), found.converged
+    weights, converged = found.weights.reshape(tracks.mean.shape[:-1]), found.converged
     if params.scatter == "intersection":
         cov = weighted_product(tracks.mean, tracks.cov, weights)[1]
     else:
