@@ -90,8 +90,11 @@ def nearest_mean(mean: Array, cov: Array, pull: Array, squared: bool) -> Project
     points = matvec(whiten, mean - origin[:, None])
     terms = _Terms(points, inverse(white), pull, squared)
     found = _squared(terms) if squared else _unsquared(terms, white)
+    nearest = origin + matvec(lower, found.at)
+    snapped = np.flatnonzero(found.snapped >= 0)
+    nearest[snapped] = mean[snapped, found.snapped[snapped]]
     return ProjectionMean(
-        origin + matvec(lower, found.at), found.weights(terms), found.state.distance, found.snapped,
+        nearest, found.weights(terms), found.state.distance, found.snapped,
         found.state.value, found.converged, found.iterations,
     )  # fmt: skip
 
