@@ -67,9 +67,7 @@ def test_quadrature_of_any_generating_function(make: object, axes: int) -> None:
     family = make(axes)  # type: ignore[operator]
     found = from_generator(lambda u: family.log_generator(u) + 3.0, axes)
     u = np.array([0.0, 0.3, 2.0, 50.0])
-    np.testing.assert_allclose(
-        [found.a, found.b, found.kappa], [family.a, family.b, family.kappa], rtol=1e-10
-    )
+    np.testing.assert_allclose([found.a, found.b, found.kappa], [family.a, family.b, family.kappa], rtol=1e-10)
     np.testing.assert_allclose(found.log_generator(u), family.log_generator(u), atol=1e-9)
 
 
@@ -127,7 +125,7 @@ def test_families_of_a_batch() -> None:
 def test_families_that_do_not_exist() -> None:
     with pytest.raises(ValueError, match=r"The 'dof' of a Student-t family must exceed 2\. Got 2\.0\."):
         student_t(np.array([3.0, 2.0]), 2)
-    with pytest.raises(ValueError, match=r"The 'beta' of a generalised Gaussian in 1 axes must exceed 0\.25\. Got 0\.2"):
+    with pytest.raises(ValueError, match=r"The 'beta' of a generalised .* 1 axes must exceed 0\.25\. Got 0\.2"):
         generalized_gaussian(0.2, 1)
     with pytest.raises(ValueError, match="must have a covariance"):
         from_generator(lambda u: -1.5 * np.log1p(u), 1)  # Student-t of two degrees of freedom

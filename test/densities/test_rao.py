@@ -25,6 +25,7 @@ from track_fusion.densities.rao import (
 from track_fusion.linalg import Array
 
 SCALAR = [student_t(3.0, 1), generalized_gaussian(0.65, 1), gaussian(1)]
+ENDS = [(2.0, 5.0, 4.0, 7.0), (4.0, 7.0, 2.0, 5.0), (1.0, 9.0, 1.0, 0.5), (0.0, 1.0, 80.0, 3.0)]
 PLANE = [student_t(3.0, 2), generalized_gaussian(0.65, 2), gaussian(2)]
 
 
@@ -39,7 +40,7 @@ def _speed_squared(family: Family, scatter: Array, mean_rate: Array, rate: Array
 
 
 @pytest.mark.parametrize("family", SCALAR)
-@pytest.mark.parametrize("ends", [(2.0, 5.0, 4.0, 7.0), (4.0, 7.0, 2.0, 5.0), (1.0, 9.0, 1.0, 0.5), (0.0, 1.0, 80.0, 3.0)])
+@pytest.mark.parametrize("ends", ENDS)
 def test_scalar_geodesic_has_the_length_of_the_metric(family: Family, ends: tuple[float, ...]) -> None:
     """Integrating (11) along the curve gives the distance (14), at constant speed; no detour is shorter."""
     points = [np.asarray(v) for v in ends]
@@ -49,8 +50,8 @@ def test_scalar_geodesic_has_the_length_of_the_metric(family: Family, ends: tupl
         h = 1e-5
         (m0, s0), (m1, s1) = (scalar_geodesic(family, *points, t + k * h) for k in (-1, 1))
         middle = scalar_geodesic(family, *points, t)[1]
-        rate = (s1 - s0) / (2 * h)
-        return math.sqrt(_speed_squared(family, middle.reshape(1, 1), np.array([(m1 - m0) / (2 * h)]), np.array([[rate]])))
+        mean_rate, rate = np.array([m1 - m0]) / (2 * h), np.array([[s1 - s0]]) / (2 * h)
+        return math.sqrt(_speed_squared(family, middle.reshape(1, 1), mean_rate, rate))
 
     assert quad(speed, 0.0, 1.0)[0] == pytest.approx(wanted, rel=1e-6)
     assert speed(0.2) == pytest.approx(wanted, rel=1e-5)
@@ -61,7 +62,10 @@ def test_scalar_geodesic_has_the_length_of_the_metric(family: Family, ends: tupl
     assert detour > wanted
 
 
-def _printed(family: Family, m1: float, s1: float, m2: float, s2: float) -> tuple[Callable[[float], tuple[float, float]], float]:
+Curve = Callable[[float], tuple[float, float]]
+
+
+def _printed(family: Family, m1: float, s1: float, m2: float, s2: float) -> tuple[Curve, float]:
     """Eqs. (17)-(21) as printed, mu1 < mu2: the curve over its arc length and the arc length of the far end."""
     c, d = 8 * family.a / (12 * family.b - 1), math.sqrt(12 * family.b - 1)
     delta1 = (2 * s2 + c * m2**2 - 2 * s1 - c * m1**2) / (2 * math.sqrt(c) * (m2 - m1))
@@ -120,9 +124,7 @@ def test_distance_at_one_mean() -> None:
 def test_distance_at_one_shape_in_one_axis_is_the_scalar_distance() -> None:
     for family in SCALAR:
         for m, s, other, scale in ((0.0, 2.0, 1.5, 1.0), (0.0, 2.0, 20.0, 0.1), (1.0, 3.0, 1.0, 4.0)):
-            got = rao_distance_same_shape(
-                family, np.array([m]), np.array([[s]]), np.array([other]), np.asarray(scale)
-            )
+            got = rao_distance_same_shape(family, np.array([m]), np.array([[s]]), np.array([other]), np.asarray(scale))
             wanted = rao_distance_scalar(family, *(np.asarray(v) for v in (m, s, other, scale * s)))
             assert got == pytest.approx(float(wanted), rel=1e-12)
 
@@ -141,7 +143,7 @@ def test_projection_distance_is_the_least_at_one_shape() -> None:
 
 
 def _path_length(family: Family, knots: Array) -> float:
-    """Length by (11) of the polygon through (mean, log of the Cholesky diagonal, the rest) in two axes, knots (N, 5)."""
+    """Length by (11) of a polygon in two axes, knots (N, 5): mean, log of the Cholesky diagonal, what is below it."""
     middle, step = 0.5 * (knots[:-1] + knots[1:]), np.diff(knots, axis=0)
     lower, rate = np.zeros((2, len(step), 2, 2))
     for i in (0, 1):

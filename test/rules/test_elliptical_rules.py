@@ -43,7 +43,7 @@ MEANS, SCATTERS = np.array([2.0, 4.0]), np.array([5.0, 7.0])
 
 
 def _static(name: str, shape: float) -> tuple[Family, dict[str, Any], Callable[[float, float], float]]:
-    """Return the family, the tracks with the parameters that say it, and the distance of (mean, cov) to the midpoint."""
+    """Return the family, the tracks with parameters that say it, and the distance of (mean, cov) to the midpoint."""
     family = student_t(shape, 1) if name == "student_t" else generalized_gaussian(shape, 1)
     tracks: dict[str, Any] = {"mean": MEANS[:, None], "cov": family.kappa * SCATTERS[:, None, None]}
     tracks |= {"dof": [shape, shape]} if name == "student_t" else {"family": name, "beta": shape}
@@ -148,7 +148,7 @@ def test_mean_is_the_global_minimum(squared: bool, spread: float) -> None:
 
 
 def test_global_minimum_that_the_first_descent_misses() -> None:
-    """Two tight groups far apart, the smaller nearer to the first start: only a start at an estimate finds the other."""
+    """Two groups far apart, the smaller nearer to the first start: only a start at an estimate finds the other."""
     rng = np.random.default_rng(2)
     missed = 0
     for _ in range(40):

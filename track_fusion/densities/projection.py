@@ -6,6 +6,7 @@ d_k is the squared Mahalanobis distance of the mean from density k.
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,7 +162,7 @@ class _Minimum:
         at, *state, snapped, converged, iterations = (array[rows] for array in self._arrays())
         return _Minimum(at, _State(*state), snapped, converged, iterations)
 
-    def _arrays(self) -> tuple[NDArray[np.generic], ...]:
+    def _arrays(self) -> tuple[NDArray[Any], ...]:
         state = self.state
         return self.at, state.value, state.distance, state.force, self.snapped, self.converged, self.iterations
 
@@ -258,7 +259,7 @@ def _descend(terms: _Terms, start: Array) -> _Minimum:
 
 def _step(terms: _Terms, at: Array, state: _State) -> tuple[Array, _State, NDArray[np.bool_]]:
     """Take the better of (47) and a step of Newton's method; halt at an estimate that has a kink."""
-    halted = np.zeros(len(at), bool) if terms.squared else (state.distance <= HERE).any(-1)
+    halted: NDArray[np.bool_] = np.asarray((state.distance <= HERE).any(-1) & (not terms.squared))
     slope, bend = terms.slopes(np.where(halted[:, None], 1.0, state.distance))
     pull = terms.pull[:, None]
     gradient = (slope[..., None] * state.force).sum(1)

@@ -73,9 +73,7 @@ def minimal_manhattan_distance(
     z = family.pull * mahalanobis_squared(mean - other_mean, scatter)
     mean_log, deviation = _log_ratio(scatter, other_scatter)
     shape = np.broadcast_shapes(np.shape(z), mean_log.shape)
-    flat = [
-        np.broadcast_to(v, shape).ravel() for v in (z, mean_log, deviation, family.radius_squared, 2.0 * family.b)
-    ]
+    flat = [np.broadcast_to(v, shape).ravel() for v in (z, mean_log, deviation, family.radius_squared, 2.0 * family.b)]
     return manhattan_paths(*flat).length.reshape(shape)
 
 

@@ -26,6 +26,17 @@ def family_param(default: str) -> str:
     return field
 
 
+def criterion_param() -> str:
+    """Make the field that chooses what the mean minimises."""
+    field: str = param(
+        "squared",
+        "what the mean minimises: the sum of the squared projection distances to the tracks, or of the distances (39), "
+        "which often makes it one track's estimate",
+        choices=("squared", "unsquared"),
+    )
+    return field
+
+
 @dataclasses.dataclass(frozen=True)
 class EllipticalParams(Params):
     """Which family the tracks belong to."""
@@ -76,11 +87,3 @@ def projected(tracks: SourceTracks, family: Family, squared: bool) -> tuple[Proj
     flat = np.broadcast_to(pull, tracks.mean.shape[:-2]).reshape(-1, 1)
     scale = 1.0 + 0.5 * flat * found.distance
     return found, scale[..., None, None] * tracks.cov.reshape(-1, count, n, n)
-
-
-CRITERION = {
-    "default": "squared",
-    "doc": "what the mean minimises: the sum of the squared projection distances to the tracks, or of the distances "
-    "(39), which often makes it one track's estimate",
-    "choices": ("squared", "unsquared"),
-}

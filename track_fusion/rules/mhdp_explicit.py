@@ -5,16 +5,15 @@ from __future__ import annotations
 import dataclasses
 
 from track_fusion.densities.spd_means import log_euclidean_mean
-from track_fusion.params import param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.elliptical_tracks import CRITERION, EllipticalParams, family_of, projected
+from track_fusion.rules.elliptical_tracks import EllipticalParams, criterion_param, family_of, projected
 
 
 @dataclasses.dataclass(frozen=True)
 class MhdpExplicitParams(EllipticalParams):
     """The family of the tracks, and what the mean minimises."""
 
-    criterion: str = param(**CRITERION)
+    criterion: str = criterion_param()
 
 
 def fuse(tracks: SourceTracks, params: MhdpExplicitParams) -> FusedTracks:
@@ -56,8 +55,8 @@ def fuse(tracks: SourceTracks, params: MhdpExplicitParams) -> FusedTracks:
         "iterations": found.iterations.reshape(batch),
         "snapped": found.snapped.reshape(batch),
     }
-    cov = log_euclidean_mean(covs).reshape(*batch, n, n)
-    return FusedTracks(found.mean.reshape(*batch, n), cov, found.weights.reshape(tracks.mean.shape[:-1]), dof, info=info)
+    mean, cov = found.mean.reshape(*batch, n), log_euclidean_mean(covs).reshape(*batch, n, n)
+    return FusedTracks(mean, cov, found.weights.reshape(tracks.mean.shape[:-1]), dof, info=info)
 
 
 RULE = Rule(

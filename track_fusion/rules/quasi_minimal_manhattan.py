@@ -61,9 +61,8 @@ def fuse(tracks: SourceTracks, params: QuasiMinimalManhattanParams) -> FusedTrac
     batch, (count, n) = tracks.mean.shape[:-2], tracks.mean.shape[-2:]
     family, dof = family_of(tracks, params)
     flat = SourceTracks(tracks.mean.reshape(-1, count, n), tracks.cov.reshape(-1, count, n, n))
-    pull, radius, weight = (
-        np.broadcast_to(v, batch).reshape(-1) for v in (family.pull * family.kappa, family.radius_squared, 2.0 * family.b)
-    )
+    constants = family.pull * family.kappa, family.radius_squared, 2.0 * family.b
+    pull, radius, weight = (np.broadcast_to(v, batch).reshape(-1) for v in constants)
     parts = [
         _weights(flat.mean[i : i + CHUNK], flat.cov[i : i + CHUNK], *(v[i : i + CHUNK] for v in (pull, radius, weight)))
         for i in range(0, max(len(flat.mean), 1), CHUNK)
@@ -112,10 +111,10 @@ class _Distances:
 
     @classmethod
     def of(cls, mean: Array, cov: Array, pull: Array, radius: Array, weight: Array) -> _Distances:
-        whiten = np.linalg.inv(np.linalg.cholesky(cov.sum(1)))[:, None]
+        whiten = _back(_root(cov.sum(1)))[:, None]
         white = symmetrise(whiten @ cov @ transpose(whiten))
         points = matvec(whiten, mean - mean[:, :1])
-        return cls(points, inverse(white), np.linalg.cholesky(white), pull, radius, weight)
+        return cls(points, inverse(white), _root(white), pull, radius, weight)
 
     def __call__(self, w: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
         points, info, root = self.points[rows], self.info[rows], self.root[rows]
@@ -129,9 +128,9 @@ class _Distances:
         mean_log = logs.mean(-1)
         rest = logs - mean_log[..., None]
         pull, radius, weight = (np.repeat(v[rows], count) for v in (self.pull, self.radius, self.weight))
-        paths = manhattan_paths(
-            pull * np.maximum(distance, 0.0).ravel(), mean_log.ravel(), np.sqrt((rest**2).sum(-1)).ravel(), radius, weight
-        )  # fmt: skip
+        z = pull * np.maximum(distance, 0.0).ravel()
+        deviation = np.sqrt((rest**2).sum(-1)).ravel()
+        paths = manhattan_paths(z, mean_log.ravel(), deviation, radius, weight)
         # Along weight j the mean moves by -P I_j (mean - x_j), P by -P I_j P.
         shift = -matvec(fused[:, None], force)
         over_mean = 2.0 * (pull * paths.over_z).reshape(batch, count, 1) * force
@@ -144,9 +143,17 @@ class _Distances:
 
 def _log_ratios(root: Array, fused: Array) -> tuple[Array, Array]:
     """Logarithms of the eigenvalues of P_k^-1 P, (B, K, n), and C_k V, V their vectors in the axes of C_k = root."""
-    back = np.linalg.inv(root)
+    back = _back(root)
     values, vectors = np.linalg.eigh(symmetrise(back @ fused[:, None] @ transpose(back)))
     return np.log(np.maximum(values, np.finfo(float).tiny)), root @ vectors
+
+
+def _root(cov: Array) -> Array:
+    return np.asarray(np.linalg.cholesky(cov), np.float64)
+
+
+def _back(root: Array) -> Array:
+    return np.asarray(np.linalg.inv(root), np.float64)
 
 
 RULE = Rule(
