@@ -37,7 +37,7 @@ def geometric_average(values: Array, weights: Array) -> Array:
         raise ValueError(f"The geometric average takes values that are not negative. Got {values.min()}.")
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.where(weights > 0, weights * np.log(values), 0.0)
-    return np.exp(logs.sum(-1))
+    return np.asarray(np.exp(logs.sum(-1)))
 
 
 # Moments of the averages.

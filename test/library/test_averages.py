@@ -51,14 +51,16 @@ def _pair(first: Array | float) -> Array:
 def test_figure_1_minima(correlation: float, aa: float, ga: float, aa_at: float | None, ga_at: float | None) -> None:
     values, probability = positive_normal_pair(MEAN, _cov(correlation))
     for geometric, least, at in ((False, aa, aa_at), (True, ga, ga_at)):
-        found = minimize_scalar(
-            lambda w, g=geometric: float(average_moments(values, probability, _pair(w), g)[1]), bounds=(0, 1), method="bounded"
-        )  # fmt: skip
+
+        def variance(w: float, geometric: bool = geometric) -> float:
+            return float(average_moments(values, probability, _pair(w), geometric)[1])
+
+        found = minimize_scalar(variance, bounds=(0, 1), method="bounded")
         assert found.fun == pytest.approx(least, abs=0.03)
         if at is not None:
             assert found.x == pytest.approx(at, abs=0.005)
     exact = variance_bounds(*VARIANCES, np.asarray(correlation))[0]
-    assert exact == pytest.approx(aa, abs=0.01)
+    assert exact == pytest.approx(aa, abs=0.01)  # the closed form (20)
 
 
 def test_figure_1_crosses_over_and_dual_bounds() -> None:
@@ -141,10 +143,11 @@ def test_geometric_moments_against_scipy_quadrature() -> None:
     pdf = multivariate_normal(MEAN, cov).pdf
 
     def moment(power: float) -> float:
-        value, _ = dblquad(
-            lambda y, x: pdf([x, y]) * (x ** w[0] * y ** w[1]) ** power, 0.0, 120.0, 0.0, 160.0, epsabs=1e-7, epsrel=1e-7
-        )  # fmt: skip
-        return float(value)
+
+        def integrand(y: float, x: float) -> float:
+            return float(pdf([x, y]) * (x ** w[0] * y ** w[1]) ** power)
+
+        return float(dblquad(integrand, 0.0, 120.0, 0.0, 160.0, epsabs=1e-7, epsrel=1e-7)[0])
 
     mass, mean = moment(0.0), moment(1.0)
     got = average_moments(*positive_normal_pair(MEAN, cov), w, True)
