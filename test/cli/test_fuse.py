@@ -118,7 +118,7 @@ def test_the_covariance_is_the_covariance_whatever_the_dof() -> None:
 
 
 def test_tracks_of_a_family_are_fused_as_such_and_say_their_dof() -> None:
-    """The static example of Chen 2022: scatters 5 and 7 of Student-t tracks, then a shape that only a parameter says."""
+    """The static example of Chen 2022: scatters 5 and 7 of Student-t tracks; then a shape that a parameter says."""
     tracks = [{"mean": [2.0], "cov": [[15.0]], "dof": 3}, {"mean": [4.0], "cov": [[21.0]], "dof": 3}]
     answer = fused(tracks, "mhdp_explicit")
     assert answer["dof"] == 3.0
