@@ -47,14 +47,14 @@ def lapack_floor(p1: Array, p2: Array) -> tuple[Array, Array, Array]:
 
 def karcher_pyriemann(groups: Array) -> list[Array]:
     """Riemannian mean of each group of covariances, (B, K, n, n): a loop over pyriemann, its defaults."""
-    from pyriemann.geometry.mean import mean_riemann
+    from pyriemann.utils.mean import mean_riemann
 
     return [mean_riemann(covs) for covs in groups]
 
 
 def log_euclidean_pyriemann(groups: Array) -> list[Array]:
     """Log-Euclidean mean of each group of covariances, (B, K, n, n): a loop over pyriemann."""
-    from pyriemann.geometry.mean import mean_logeuclid
+    from pyriemann.utils.mean import mean_logeuclid
 
     return [mean_logeuclid(covs) for covs in groups]
 
