@@ -11,10 +11,14 @@ from track_fusion.rules import (
     ellipsoidal_intersection,
     fast_covariance_intersection,
     fault_tolerant_covariance_intersection,
+    geodesic_projection,
     geometric_average,
     harmonic_mean,
     inverse_covariance_intersection,
+    mhdp_explicit,
+    mhdp_iterative,
     naive,
+    quasi_minimal_manhattan,
     split_covariance_intersection,
 )
 from track_fusion.rules.base import FusedTracks, Mixture, Rule, SourceTracks
@@ -32,6 +36,10 @@ _MODULES = (
     harmonic_mean,
     cross_covariance,
     split_covariance_intersection,
+    mhdp_explicit,
+    mhdp_iterative,
+    quasi_minimal_manhattan,
+    geodesic_projection,
 )
 
 #: Every rule by its key: what `state_fusion` may be.
