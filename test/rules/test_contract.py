@@ -17,6 +17,7 @@ from rules.examples import (
     build,
     covariances,
     example_of,
+    joint_covariances,
     select,
     tracks_for,
     with_extras,
@@ -174,21 +175,6 @@ def test_affine_equivariance(rule: Rule, values: Values, count: int) -> None:
 # Guarantees ---------------------------------------------------------------------------------------------------------
 
 
-def joint_covariances(rng: np.random.Generator, cov: Array, count: int) -> Array:
-    """Draw joint error covariances (count, K n, K n) with these diagonal blocks, from slack to fully dependent."""
-    sources, n = cov.shape[:2]
-    size = sources * n
-    joint = np.empty((count, size, size))
-    for i in range(count):
-        rank = rng.integers(n, size + 3)  # rank n: each source's error is a function of any other's
-        root = rng.normal(size=(sources, n, rank)) * 10.0 ** rng.normal(size=rank)
-        # Each block of rows is made orthonormal, then coloured by its track's covariance.
-        root = np.swapaxes(np.linalg.qr(np.swapaxes(root, -1, -2))[0], -1, -2)
-        coloured = (np.linalg.cholesky(cov) @ root).reshape(size, rank)
-        joint[i] = coloured @ coloured.T
-    return joint
-
-
 def _gain(rule: Rule, params: Any, tracks: SourceTracks) -> tuple[Array, Array]:
     """Read the linear estimator x = G (x_1, ..., x_K) off the rule, and what it claims when all means agree.
 
@@ -198,7 +184,9 @@ def _gain(rule: Rule, params: Any, tracks: SourceTracks) -> tuple[Array, Array]:
     probes = np.concatenate([np.zeros((1, sources * n)), np.eye(sources * n)]).reshape(-1, sources, n)
     trial = np.random.default_rng(0).normal(size=(1, sources, n))
     means = np.concatenate([probes, trial])
-    repeat = dataclasses.replace(tracks, mean=means, cov=np.broadcast_to(tracks.cov, (len(means), *tracks.cov.shape)))
+    extras = {k: np.broadcast_to(v, (len(means), *v.shape)) for k, v in tracks.extras.items() if hasattr(v, "shape")}
+    cov = np.broadcast_to(tracks.cov, (len(means), *tracks.cov.shape))
+    repeat = dataclasses.replace(tracks, mean=means, cov=cov, extras=extras)
     fused = rule.fuse(repeat, params)
     gain = fused.mean[1:-1].T - fused.mean[0][:, None]
     np.testing.assert_allclose(gain @ trial.reshape(-1), fused.mean[-1], atol=1e-7)
@@ -319,6 +307,11 @@ def test_malformed_tracks(rule: Rule) -> None:
     for name in rule.needs:
         assert fail(extras={}) == f"The rule '{rule.key}' needs '{name}' beside the tracks. Got none."
         break
+    for name, parameter, value in rule.needs_when:
+        params = from_dict(rule.params, {parameter: value})
+        assert rule.needed(params) == (*rule.needs, name)
+        text = _fail(rule, dataclasses.replace(good, extras={}), params)
+        assert text == f"The rule '{rule.key}' needs '{name}' beside the tracks. Got none."
 
 
 def test_misspelt_rule() -> None:

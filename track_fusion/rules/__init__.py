@@ -6,18 +6,41 @@ from track_fusion.params import unknown_name_error
 from track_fusion.rules import (
     arithmetic_average,
     covariance_intersection,
+    covariance_union,
+    cross_covariance,
+    ellipsoidal_intersection,
+    fast_covariance_intersection,
+    fault_tolerant_covariance_intersection,
     geodesic_projection,
+    geometric_average,
+    harmonic_mean,
+    inverse_covariance_intersection,
     mhdp_explicit,
     mhdp_iterative,
     naive,
     quasi_minimal_manhattan,
+    split_covariance_intersection,
 )
 from track_fusion.rules.base import FusedTracks, Mixture, Rule, SourceTracks
 
 _MODULES = (
-    naive, covariance_intersection, arithmetic_average,
-    mhdp_explicit, mhdp_iterative, quasi_minimal_manhattan, geodesic_projection,
-)  # fmt: skip
+    naive,
+    covariance_intersection,
+    fast_covariance_intersection,
+    fault_tolerant_covariance_intersection,
+    inverse_covariance_intersection,
+    ellipsoidal_intersection,
+    covariance_union,
+    geometric_average,
+    arithmetic_average,
+    harmonic_mean,
+    cross_covariance,
+    split_covariance_intersection,
+    mhdp_explicit,
+    mhdp_iterative,
+    quasi_minimal_manhattan,
+    geodesic_projection,
+)
 
 #: Every rule by its key: what `state_fusion` may be.
 RULES: dict[str, Rule] = {module.RULE.key: module.RULE for module in _MODULES}
