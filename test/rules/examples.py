@@ -50,7 +50,7 @@ def _naive_copies() -> tuple[float, float]:
 
 
 def _diagonal_pair(key: str, ratio: float, values: Values, cross: Array) -> float:
-    """Fuse diag(1, r) and diag(r, 1); return the error variance over the claim along (1, 1), given the cross one."""
+    """Fuse diag(1, r) and diag(r, 1); return the error variance over the claim, along (1, 1), at this cross-covariance."""
     from track_fusion.rules import RULES
 
     rule, cov = RULES[key], np.stack([np.diag([1.0, ratio]), np.diag([ratio, 1.0])])
@@ -163,6 +163,7 @@ def joint_covariances(rng: np.random.Generator, cov: Array, count: int) -> Array
 GIVEN: Values = {"criterion": "given", "weights": EACH}
 TRACE: Values = {"criterion": "trace"}
 UNIFORM: Values = {"criterion": "uniform"}
+
 
 def _shared_error(key: str, stated: float) -> Callable[[], tuple[float, float]]:
     """Three scalar tracks of variance 1: an error of 10 that a random pair shares in 1.5 % of all cases."""

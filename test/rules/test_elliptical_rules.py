@@ -79,7 +79,10 @@ def test_static_example(name: str, shape: float, mhdp: float, fci: float) -> Non
         assert distance(fused.mean[0], fused.cov[0, 0]) == pytest.approx(mhdp, abs=1e-4)
         assert (fused.dof is None) == (name != "student_t")
     assert both[0].cov[0, 0] == pytest.approx(both[1].cov[0, 0], rel=1e-12)
-    assert distance(*_halfway(tracks["cov"][:, 0, 0])) == pytest.approx(fci, abs=1e-4)
+    halfway = _halfway(tracks["cov"][:, 0, 0])
+    assert distance(*halfway) == pytest.approx(fci, abs=1e-4)
+    fast = fuse("fast_covariance_intersection", tracks["mean"], tracks["cov"])
+    np.testing.assert_allclose((fast.mean[0], fast.cov[0, 0]), halfway, rtol=1e-9)
 
 
 @EVERY_STATIC
