@@ -41,6 +41,21 @@ def inverse(cov: Array) -> Array:
     return symmetrise(np.asarray(np.linalg.inv(cov), np.float64))
 
 
+def cholesky(cov: Array) -> Array:
+    """Lower triangular factors of positive definite matrices, (..., n, n).
+
+    Raises
+    ------
+    LinAlgError    a matrix is not positive definite
+    """
+    return np.asarray(np.linalg.cholesky(cov), np.float64)
+
+
+def whitener(cov: Array) -> Array:
+    """W, lower triangular, with W P W' = 1 for positive definite matrices P, (..., n, n)."""
+    return np.asarray(np.linalg.inv(cholesky(cov)), np.float64)
+
+
 def logdet(cov: Array) -> Array:
     """Log-determinant of positive definite matrices, (..., n, n) -> (...)."""
     diagonal = np.diagonal(np.linalg.cholesky(cov), axis1=-2, axis2=-1)
