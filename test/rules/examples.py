@@ -49,6 +49,17 @@ def _naive_copies() -> tuple[float, float]:
     return float(np.trace(error) / np.trace(fused.cov)), 4.0
 
 
+def _overlapping_copies() -> tuple[float, float]:
+    """Two copies of a track with components N(+-sqrt 2, 1), fused by powers of components."""
+    from track_fusion.rules import RULES
+
+    part = Mixture(np.full((2, 2), 0.5), np.full((2, 2, 1), 2**0.5) * [[1.0], [-1.0]], np.ones((2, 2, 1, 1)))
+    fused = RULES["mixture_geometric"](SourceTracks(np.zeros((2, 1)), np.full((2, 1, 1), 3.0), mixture=part))
+    return 3.0 / float(fused.cov[0, 0]), 3.0 / 2.462
+
+
+AVERAGES: tuple[Values, ...] = ({}, {"criterion": "given", "weights": EACH})
+
 EXAMPLES: dict[str, Example] = {
     "naive": Example(idempotent=False, counter_example=_naive_copies),
     "covariance_intersection": Example(
@@ -60,6 +71,9 @@ EXAMPLES: dict[str, Example] = {
         params=({}, {"criterion": "uniform", "output": "mixture"}, {"criterion": "given", "weights": EACH}),
         guaranteed=({"criterion": "uniform"}, {"criterion": "given", "weights": EACH}),
     ),
+    "mixture_average": Example(params=(*AVERAGES, {"max_components": 3}), guaranteed=AVERAGES),
+    "mixture_geometric": Example(params=AVERAGES, idempotent=False, counter_example=_overlapping_copies),
+    "mixture_hybrid": Example(params=AVERAGES, idempotent=False, counter_example=_overlapping_copies),
 }
 
 

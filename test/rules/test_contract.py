@@ -198,11 +198,23 @@ def _gain(rule: Rule, params: Any, tracks: SourceTracks) -> tuple[Array, Array]:
     probes = np.concatenate([np.zeros((1, sources * n)), np.eye(sources * n)]).reshape(-1, sources, n)
     trial = np.random.default_rng(0).normal(size=(1, sources, n))
     means = np.concatenate([probes, trial])
-    repeat = dataclasses.replace(tracks, mean=means, cov=np.broadcast_to(tracks.cov, (len(means), *tracks.cov.shape)))
-    fused = rule.fuse(repeat, params)
+    fused = rule.fuse(_at(tracks, means), params)
     gain = fused.mean[1:-1].T - fused.mean[0][:, None]
     np.testing.assert_allclose(gain @ trial.reshape(-1), fused.mean[-1], atol=1e-7)
     return gain, fused.cov[0]
+
+
+def _at(tracks: SourceTracks, means: Array) -> SourceTracks:
+    """Move tracks (K, n) to means (B, K, n), their components with them."""
+
+    def repeat(array: Array) -> Array:
+        return np.broadcast_to(array, (len(means), *array.shape))
+
+    mixture = tracks.mixture
+    if mixture is not None:
+        moved = mixture.mean + (means - tracks.mean)[:, :, None]
+        mixture = dataclasses.replace(mixture, weight=repeat(mixture.weight), mean=moved, cov=repeat(mixture.cov))
+    return dataclasses.replace(tracks, mean=means, cov=repeat(tracks.cov), mixture=mixture)
 
 
 def _worst(rule: Rule, values: Values, sources: int, rng: np.random.Generator, joints: int) -> float:

@@ -146,3 +146,24 @@ def gaussian_quotient(mean: Array, cov: Array, other_mean: Array, other_cov: Arr
         np.where(proper[..., None, None], new_cov, cov),
         proper,
     )
+
+
+def average(parts: Mixture, weights: Array) -> Mixture:
+    """Arithmetic average of K mixtures: the union of their components, Li 2019 (9).
+
+    Parameters
+    ----------
+    parts : Mixture    weight (..., K, C) and so on; weights are taken as they are
+    weights : (..., K)
+
+    Returns
+    -------
+    Mixture    (..., K C)
+    """
+    *lead, sources, count = parts.weight.shape
+    n = parts.mean.shape[-1]
+    return Mixture(
+        (weights[..., None] * parts.weight).reshape(*lead, sources * count),
+        parts.mean.reshape(*lead, sources * count, n),
+        parts.cov.reshape(*lead, sources * count, n, n),
+    )

@@ -3,10 +3,24 @@
 from __future__ import annotations
 
 from track_fusion.params import unknown_name_error
-from track_fusion.rules import arithmetic_average, covariance_intersection, naive
+from track_fusion.rules import (
+    arithmetic_average,
+    covariance_intersection,
+    mixture_average,
+    mixture_geometric,
+    mixture_hybrid,
+    naive,
+)
 from track_fusion.rules.base import FusedTracks, Mixture, Rule, SourceTracks
 
-_MODULES = (naive, covariance_intersection, arithmetic_average)
+_MODULES = (
+    naive,
+    covariance_intersection,
+    arithmetic_average,
+    mixture_average,
+    mixture_geometric,
+    mixture_hybrid,
+)
 
 #: Every rule by its key: what `state_fusion` may be.
 RULES: dict[str, Rule] = {module.RULE.key: module.RULE for module in _MODULES}
