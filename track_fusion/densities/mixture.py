@@ -120,45 +120,54 @@ class Factored:
 
     def joint(self, points: Array) -> Array:
         """Log of weight times density of each component at points (..., S, n): (..., C, S)."""
-        return _joint(points, *self._rows())
+        origin, rows, log_scale = self._rows()
+        return _joint(_augmented(points, origin), rows, log_scale)
 
     def log_pdf(self, points: Array) -> Array:
         """Log-density at points (..., S, n): (..., S); see :func:`log_pdf`."""
         lead = np.broadcast_shapes(self.lead, points.shape[:-2])
-        parts = [np.broadcast_to(a, (*lead, *a.shape[-k:])) for a, k in zip(self._rows(), (1, 3, 2), strict=True)]
-        size = math.prod(lead)
-        flat = [a.reshape(size, *a.shape[len(lead) :]) for a in parts]
-        points = np.broadcast_to(points, (*lead, *points.shape[-2:])).reshape(size, *points.shape[-2:])
-        values = np.empty(points.shape[:-1])
-        for batch, piece in _pieces(size, points.shape[-2], self.mean.shape[-2]):
-            values[batch, piece] = log_sum_exp(_joint(points[batch, piece], *(a[batch] for a in flat)), -2)
-        return values.reshape(*lead, points.shape[-2])
+        size, count = math.prod(lead), points.shape[-2]
+        origin, *factors = self._rows()
+        x, rows, log_scale = (
+            np.broadcast_to(a, (*lead, *a.shape[-k:])).reshape(size, *a.shape[-k:])
+            for a, k in zip((_augmented(points, origin), *factors), (2, 3, 2), strict=True)
+        )
+        values = np.empty((size, count))
+        for batch, piece in _pieces(size, count, self.mean.shape[-2]):
+            values[batch, piece] = log_sum_exp(_joint(x[batch, :, piece], rows[batch], log_scale[batch]), -2)
+        return values.reshape(*lead, count)
 
     def derivatives(self, points: Array) -> tuple[Array, Array, Array]:
         """Log-density (..., S), its gradient (..., S, n) and its Hessian (..., S, n, n) at points (..., S, n)."""
+        n, count = points.shape[-1], self.mean.shape[-2]
         z = self.white @ (transpose(points)[..., None, :, :] - self.mean[..., None])
         joint = self.log_scale[..., None] - 0.5 * (z * z).sum(-2)
         value = log_sum_exp(joint, -2)
         share = np.exp(joint - np.where(np.isfinite(value), value, 0.0)[..., None, :])
-        pull = np.moveaxis(transpose(self.white) @ z, -1, -3)  # (..., S, C, n): P^-1 (x - m)
-        share = transpose(share)
-        gradient = -(share[..., None, :] @ pull)[..., 0, :]
-        info = transpose(self.white) @ self.white
-        mean_info = (share @ info.reshape(*self.lead, self.mean.shape[-2], -1)).reshape(*points.shape, points.shape[-1])
-        hessian = transpose(share[..., None] * pull) @ pull - mean_info - outer(gradient)
+        pull = transpose(self.white) @ z  # (..., C, n, S): P^-1 (x - m)
+        gradient = -transpose((share[..., None, :] * pull).sum(-3))
+        second = ((share[..., None, :] * pull)[..., :, None, :] * pull[..., None, :, :]).sum(-4)
+        info = (transpose(self.white) @ self.white).reshape(*self.lead, count, n * n)
+        mean_info = (transpose(share) @ info).reshape(*points.shape, n)
+        hessian = np.moveaxis(second, -1, -3) - mean_info - outer(gradient)
         return value, gradient, symmetrise(hessian)
 
 
-def _joint(points: Array, origin: Array, rows: Array, log_scale: Array) -> Array:
+def _augmented(points: Array, origin: Array) -> Array:
+    """Points about the origin with axes first and a row of ones above them, (..., 1 + n, S)."""
+    x = transpose(points - origin[..., None, :])
+    whole = np.empty((*x.shape[:-2], x.shape[-2] + 1, x.shape[-1]))
+    whole[..., 0, :], whole[..., 1:, :] = 1.0, x
+    return whole
+
+
+def _joint(x: Array, rows: Array, log_scale: Array) -> Array:
     """Log of weight times density (..., C, S), summing the squares of W (x - m) axis by axis.
 
     Row i of W, lower triangular, needs the first i + 1 axes and the offset alone; temporaries stay small.
     """
-    n = points.shape[-1]
-    x = transpose(points - origin[..., None, :])
-    x = np.concatenate([np.ones_like(x[..., :1, :]), x], -2)
     square: Array | None = None
-    for i in range(n):
+    for i in range(x.shape[-2] - 1):
         z = rows[..., i, :, : i + 2] @ x[..., : i + 2, :]
         z *= z
         square = z if square is None else np.add(square, z, out=square)

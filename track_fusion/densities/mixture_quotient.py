@@ -185,7 +185,7 @@ class Laplace(NamedTuple):
 
 MAX_NEWTON = 60
 #: Newton's method ends when half its decrement, the fall still to be expected in nats, is below this.
-DECREMENT = 1e-10
+DECREMENT = 1e-8
 #: Curvatures below this share of the numerator's are not trusted.
 FLOOR = 1e-3
 #: Relative error of the cost, which must not forbid a last short step.
@@ -203,7 +203,6 @@ def laplace(quotient: Quotient) -> Laplace:
     """
     weight, centre, cov = quotient.numerator
     lower = cholesky(cov)
-    n = centre.shape[-1]
     y, damping = np.zeros(centre.shape), np.ones(centre.shape[:-1])
     value, gradient, hessian = _cost(quotient, centre, lower, y)
     done = np.zeros(damping.shape, bool)

@@ -173,7 +173,9 @@ def weighted_em(
     return Learned(mixture, converged, step)
 
 
-def single_shot_em(samples: Weighted, numerator: LogMixture, floor: float = 0.1) -> Mixture:
+def single_shot_em(
+    samples: Weighted, numerator: LogMixture, floor: float = 0.1, joint: Array | None = None
+) -> Mixture:
     """Algorithm 3: share weighted samples of a quotient among its mixands once, and match their moments.
 
     The responsibilities are the true ones: those of the numerator's Gaussians, as the denominator cancels (45).
@@ -183,6 +185,7 @@ def single_shot_em(samples: Weighted, numerator: LogMixture, floor: float = 0.1)
     samples : Weighted          (..., S) of the whole quotient
     numerator : LogMixture      (..., M)
     floor : float               smallest covariance, as a share of the numerator's
+    joint : (..., M, S) or None log of the numerator's parts at the samples, if known
 
     Returns
     -------
@@ -191,11 +194,14 @@ def single_shot_em(samples: Weighted, numerator: LogMixture, floor: float = 0.1)
     References    N. R. Ahmed, Algorithm 3, eqs. (44)-(45).
     """
     parts = numerator.normalised
-    joint = Factored.of(parts, numerator.log_weight).joint(samples.points)
-    total = log_sum_exp(joint, -2)
+    if joint is None:
+        joint = Factored.of(parts, numerator.log_weight).joint(samples.points)
     theta = normalised(samples.log_weight)
-    safe = np.where(np.isfinite(total), total, 0.0)
-    return _maximise(samples.points, np.exp(joint - safe[..., None, :]) * theta[..., None, :], parts, parts.cov, floor)
+    top = joint.max(-2, keepdims=True)
+    gamma = np.exp(joint - np.where(np.isfinite(top), top, 0.0))
+    total = gamma.sum(-2)
+    gamma *= (theta / np.where(total > 0.0, total, 1.0))[..., None, :]
+    return _maximise(samples.points, gamma, parts, parts.cov, floor)
 
 
 #: A component with less than this share of the samples has no moments of its own.
@@ -256,12 +262,30 @@ def laplace_proposal(quotient: Quotient, inflation: float = 2.0, found: Laplace 
     return Mixture(normalised(part.log_moment), part.mean, inflation * part.cov)
 
 
-def sample_quotient(quotient: Quotient, proposal: Mixture, rng: np.random.Generator, count: int) -> Weighted:
-    """Draw samples from a proposal (..., C), weighted for a whole quotient: w_z N_z summed, over u and the proposal."""
+class Global(NamedTuple):
+    """What indirect global sampling gives: the fused mixture (..., M) and the samples behind it."""
+
+    mixture: Mixture
+    samples: Weighted
+
+
+def indirect_global_sampling(
+    quotient: Quotient, proposal: Mixture, rng: np.random.Generator, count: int, floor: float = 0.1
+) -> Global:
+    """IGS for exact fusion: samples of a whole quotient from one proposal, shared out by Algorithm 3.
+
+    Parameters
+    ----------
+    quotient : Quotient      (..., M) mixands
+    proposal : Mixture       (..., C), by :func:`laplace_proposal`
+    rng, count, floor        generator, number of samples in all, smallest covariance as in `single_shot_em`
+    """
     points = sample(proposal, rng, count).points
     weight, mean, cov = quotient.numerator
-    above = Factored.of(Mixture(np.ones(weight.shape), mean, cov), weight).log_pdf(points)
-    return Weighted(points, above - quotient.log_denominator(points) - Factored.of(proposal).log_pdf(points))
+    joint = Factored.of(Mixture(np.ones(weight.shape), mean, cov), weight).joint(points)
+    below = quotient.log_denominator(points) + Factored.of(proposal).log_pdf(points)
+    samples = Weighted(points, log_sum_exp(joint, -2) - below)
+    return Global(single_shot_em(samples, quotient.numerator, floor, joint), samples)
 
 
 class Proposal(NamedTuple):
