@@ -1,66 +1,61 @@
-"""Lockstep steps a second of the demo's chain, against the same processes with empty callbacks."""
+"""Lockstep steps of the demo's chain (replay, two trackers, centre) against the same processes with empty callbacks."""
 
 from __future__ import annotations
 
 import os
 import re
-import sys
+import statistics
 import tempfile
 import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+from benchmark.measure import Result
+from track_fusion.nodes.bringup import Nodes, local_environment, running, start_scenario
 
 STEPS = 1000
 REPEATS = 3
-#: A step of the real chain may cost so many steps of the empty one.
-TARGET = 2.0
+DEADLINE_S = 120.0
 
 
-class _Modules:
-    """Starts the empty chain's trackers and centre instead of the real ones."""
+class EmptyNodes:
+    """Starts trackers and centre with their work taken out, in place of the real ones."""
 
-    def __init__(self, nodes):
+    def __init__(self, nodes: Nodes) -> None:
         self._nodes = nodes
 
-    def __getattr__(self, name):
-        return getattr(self._nodes, name)
-
-    def start(self, executable, name, arguments):
+    def start(self, executable: str, name: str, arguments: Sequence[str]) -> None:
         if executable in ("sensor_tracker", "fusion_centre"):
-            module, arguments = "benchmark.empty_chain", [executable, *arguments]
+            self._nodes.start_module("benchmark.empty_chain", name, [executable, *arguments])
         else:
-            module = f"track_fusion.nodes.{executable}"
-        self._nodes.start_module(module, name, arguments)
+            self._nodes.start(executable, name, arguments)
 
 
-def seconds_a_step(empty: bool, rule: str = "covariance_intersection") -> float:
+def seconds_a_step(empty: bool) -> float:
     """Run the chain once; wall seconds a step as the replay node counts them."""
-    from track_fusion.nodes.bringup import local_environment, running, start_scenario
-
-    overrides = {"replay": {"steps": STEPS, "expected_truth_subscribers": 0}}
-    overrides["fusion_centre"] = {"expected_subscribers": 3}
+    overrides = {
+        "replay": {"steps": STEPS, "expected_truth_subscribers": 0},
+        "fusion_centre": {"expected_subscribers": 3},
+    }
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "log"
-        with running(local_environment((os.getpid() + empty) % 100), log) as nodes:
-            start_scenario(_Modules(nodes) if empty else nodes, "li2022-linear", rule, overrides, evaluator=False)
-            replay, deadline = nodes.processes["replay"], time.monotonic() + 120
+        with running(local_environment(os.getpid() % 100), log) as nodes:
+            chain = EmptyNodes(nodes) if empty else nodes
+            start_scenario(chain, "li2022-linear", "covariance_intersection", overrides, evaluator=False)
+            replay, deadline = nodes.processes["replay"], time.monotonic() + DEADLINE_S
             while replay.poll() is None and nodes.failed() is None and time.monotonic() < deadline:
                 time.sleep(0.05)
         found = re.search(r"Replayed (\d+) steps in ([\d.]+) s", log.read_text())
         if not found:
-            sys.exit(f"The chain did not finish:\n{log.read_text()}")
+            raise RuntimeError(f"The chain did not finish:\n{log.read_text()}")
         return float(found[2]) / int(found[1])
 
 
-def measure() -> None:
-    """Print both chains, in turn, and their ratio."""
-    real, empty = [], []
-    for _ in range(REPEATS):
-        empty.append(seconds_a_step(empty=True))
-        real.append(seconds_a_step(empty=False))
-    ratio = sorted(r / e for r, e in zip(real, empty))[REPEATS // 2]
-    print(f"empty chain {1e3 * min(empty):.2f} ms a step, real chain {1e3 * min(real):.2f} ms "
-          f"({1 / min(real):.0f} steps/s), ratio {ratio:.2f} (target <= {TARGET})")
-
-
-if __name__ == "__main__":
-    measure()
+def run() -> Iterator[Result]:
+    pairs = [(seconds_a_step(empty=True), seconds_a_step(empty=False)) for _ in range(REPEATS)]
+    empty, real = (statistics.median(side) for side in zip(*pairs, strict=True))
+    ratio = statistics.median(r / e for e, r in pairs)
+    yield Result("a step, empty callbacks", empty, figure=f"{1e3 * empty:.2f} ms, {1 / empty:.0f} steps/s")
+    yield Result(
+        "a step", real, "empty callbacks", ratio, at_most=2.0, figure=f"{1e3 * real:.2f} ms, {1 / real:.0f} steps/s"
+    )

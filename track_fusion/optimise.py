@@ -162,7 +162,7 @@ def _interior_step(
     The aim and the distance kept from the boundary shrink with the gap, so that the last steps square it.
     """
     sources = w.shape[1]
-    centre = (np.minimum(.01, gap) * gap * scale / sources)[:, None] / w
+    centre = (np.minimum(0.01, gap) * gap * scale / sources)[:, None] / w
     kkt = np.ones((len(w), sources + 1, sources + 1))
     kkt[:, :sources, :sources] = hessian
     diagonal = np.arange(sources)

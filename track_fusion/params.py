@@ -38,7 +38,7 @@ class Spec:
     def wanted(self) -> str:
         """Say in words which values are allowed."""
         if self.choices:
-            return "one of " + ", ".join(repr(c) for c in self.choices)
+            return ("a list out of " if self.sequence else "one of ") + ", ".join(repr(c) for c in self.choices)
         noun = {float: "a number", int: "an integer", bool: "true or false", str: "a string"}[self.kind]
         if self.sequence:
             noun = {float: "numbers", int: "integers", str: "strings", bool: "booleans"}[self.kind]

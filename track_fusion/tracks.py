@@ -181,7 +181,13 @@ class TrackBatch:
         Raises
         ------
         ValueError    the shapes do not fit each other (there is no telling which track is bad)
+        TypeError     an array is missing or unknown
         """
+        fields = dataclasses.fields(cls)
+        wrong = [f.name for f in fields if f.default is dataclasses.MISSING and f.name not in arrays]
+        wrong += arrays.keys() - {f.name for f in fields}
+        if wrong:
+            raise TypeError(f"The array '{wrong[0]}' of a batch is {'unknown' if wrong[0] in arrays else 'missing'}.")
         batch = cls._trusted(**arrays)
         _coerce(batch)
         rejected: Counter[str] = Counter()
@@ -196,13 +202,15 @@ class TrackBatch:
     def _trusted(cls, **fields: Any) -> TrackBatch:
         """Build without checks, from fields that come from a checked batch."""
         batch = object.__new__(cls)
-        for f in dataclasses.fields(cls):
-            object.__setattr__(batch, f.name, fields[f.name] if f.name in fields else f.default)
+        vars(batch).update(uuid=None, phd=False)
+        vars(batch).update(fields)
         return batch
 
     def replace(self, **fields: Any) -> TrackBatch:
         """Return a batch with some arrays exchanged for computed ones of the same N; not checked again."""
-        return self._trusted(**{**vars(self), **fields})
+        kept = vars(self) | fields
+        kept.pop("moments", None)  # cached, of the arrays before
+        return self._trusted(**kept)
 
     def __getitem__(self, index: Any) -> TrackBatch:
         """Select tracks by a mask, an index array or a slice."""
@@ -293,6 +301,8 @@ def _coerce(batch: TrackBatch) -> None:
 
 def _faults(batch: TrackBatch) -> dict[str, NDArray[np.bool_]]:
     """Tell by reason which tracks are bad, in the order in which reasons are reported."""
+    if _is_clean(batch):
+        return {}
     none = np.zeros(len(batch), bool)
     finite = np.asarray(np.isfinite(batch.mean).all((1, 2)) & np.isfinite(batch.cov).all((1, 2, 3)))
     safe = batch.cov if finite.all() else np.where(finite[:, None, None, None], batch.cov, np.eye(batch.layout.size))
@@ -316,6 +326,31 @@ def _faults(batch: TrackBatch) -> dict[str, NDArray[np.bool_]]:
         "bad_track_id": (batch.track_id < 0) | (batch.track_id > 0xFFFFFFFF),
         "duplicate_track_id": _repeated(batch.track_id) if len(batch) > 1 else none,
     }
+
+
+def _is_clean(batch: TrackBatch) -> bool:
+    """Tell quickly that no track is bad; false when a track may be (it is looked at closely then)."""
+    if not len(batch):
+        return True
+    mean, cov, weight = batch.mean, batch.cov, batch.weight
+    # Comparisons are false for NaN, so that these refuse it as well.
+    if not (mean.max() <= ABSURD and mean.min() >= -ABSURD and cov.max() <= ABSURD**2 and cov.min() >= -(ABSURD**2)):
+        return False
+    normal = batch.phd or np.abs(weight.sum(1) - 1.0).max() <= WEIGHT_TOLERANCE
+    existence, ids = batch.existence, batch.track_id
+    return bool(
+        normal
+        and weight.min() >= 0
+        and existence.min() >= 0
+        and existence.max() <= 1
+        and batch.dof.min() > 2
+        and ids.min() >= 0
+        and ids.max() <= 0xFFFFFFFF
+        and (len(ids) == 1 or len(np.unique(ids)) == len(ids))
+        and (weight.sum(1).min() > 0 if batch.phd else True)
+        and (cov == transpose(cov)).all()
+        and is_positive_definite(cov).all()
+    )
 
 
 def _definite(batch: TrackBatch, cov: Array, size: Array) -> NDArray[np.bool_]:

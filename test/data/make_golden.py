@@ -36,6 +36,7 @@ PARAMETERS = {
     "deletion_threshold": [4, 5], "max_coast_s": 2.0,
     "noise_form": "piecewise_constant", "process_noise": 2.0, "out_of_sequence": "predict",
     "publish_tentative": False, "fuse_confirmed_only": True, "fuse_coasted": True,
+    "covariance_intersection.criterion": "det", "arithmetic_average.criterion": "uniform",
 }  # fmt: skip
 AXES = PARAMETERS["layout"]
 START_STATE = {"A": [20.0, 42.0, 8.0, 1.0], "B": [20.0, 48.0, 8.0, -1.0], "C": [95.0, 25.0, -4.0, 5.0]}
@@ -296,7 +297,7 @@ def run_centre(scans, rule):
             candidates += [(source, rows[i]["track_id"], older[j]["track_id"]) for i, j in d2]
             for i, j in pairs.items():
                 older[j]["members"][source] = rows[i]
-            left = [row for i, row in enumerate(rows) if i not in pairs]
+            left = [row for i, row in enumerate(rows) if i not in pairs and source in new]
             groups = central[len(older) :]
             pairs, _ = associate(left, groups, margins)
             for i, row in enumerate(left):

@@ -98,6 +98,13 @@ def covariances(rng: np.random.Generator, *shape: int, n: int = 4) -> Array:
     return root @ np.swapaxes(root, -1, -2)
 
 
+def rotated(rng: np.random.Generator, eigenvalues: Array) -> Array:
+    """Draw a covariance with these eigenvalues in a random orientation."""
+    basis = np.linalg.qr(rng.normal(size=(len(eigenvalues),) * 2))[0]
+    cov = (basis * eigenvalues) @ basis.T
+    return 0.5 * (cov + cov.T)
+
+
 def tracks_for(rule: Rule, rng: np.random.Generator, lead: tuple[int, ...], count: int, n: int = 4) -> SourceTracks:
     """Draw K tracks of the rule's family with what it needs; read-only, so that a rule cannot write to them."""
     mean, cov = 2.0 * rng.normal(size=(*lead, count, n)), covariances(rng, *lead, count, n=n)

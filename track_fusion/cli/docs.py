@@ -99,7 +99,7 @@ def _rule_section(rule: dict[str, Any]) -> str:
 
     parts = [f"## {rule['key']}", f"{rule['title']}.", "\n".join(f"* {name}: {text}" for name, text in facts(rule))]
     if not rule["parameters"]:
-        return "\n\n".join([*parts, "No parameters."])
+        return "\n\n".join(parts)
     rows = [
         (f"`{p['name']}`", f"`{shown_default(p['default'])}`", p["wanted"] + (f" [{p['unit']}]" if p["unit"] else ""),
          p["doc"])

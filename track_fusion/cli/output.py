@@ -6,12 +6,15 @@ import dataclasses
 import json
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import click
 import numpy as np
+from rich import box
 from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
 from track_fusion.params import Spec, specs
 
@@ -23,6 +26,22 @@ def console(*, stderr: bool = False) -> Console:
     """Return a console of the terminal's width, or a wide one for a file."""
     stream = sys.stderr if stderr else sys.stdout
     return Console(stderr=stderr, highlight=False, width=None if stream.isatty() else FILE_WIDTH)
+
+
+def table(*columns: str, title: str | None = None) -> Table:
+    """Return a table without frame, narrow enough for a terminal of 80 columns; long words wrap."""
+    found = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    for column in columns:
+        found.add_column(column, overflow="fold")
+    return found
+
+
+def grid(facts: Iterable[tuple[str, str]]) -> Table:
+    """Return names beside texts, slightly indented."""
+    found = Table.grid(padding=(0, 2, 0, 0))
+    for name, text in facts:
+        found.add_row(f"  {escape(name)}", escape(text))
+    return found
 
 
 def plain(value: Any) -> Any:
@@ -42,7 +61,7 @@ def plain(value: Any) -> Any:
 
 def print_json(value: Any, *, indent: int | None = None) -> None:
     """Print valid JSON: no NaN, no Infinity."""
-    click.echo(json.dumps(plain(value), indent=indent, allow_nan=False, ensure_ascii=False))
+    click.echo(json.dumps(plain(value), indent=indent, allow_nan=False))
 
 
 def parameters(params: Any) -> list[dict[str, Any]]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from typing import TYPE_CHECKING, Any
 
 import click
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from track_fusion.scenarios import Scenario
 
 #: Colours of the verdicts in the table.
@@ -43,7 +46,7 @@ def reproduce(names: tuple[str, ...], runs: int | None, seed: int, as_json: bool
         began = time.monotonic()
         results.append(_run(scenario, runs or scenario.default_runs, seed))
         if not as_json:
-            _print_table(scenario, results[-1], time.monotonic() - began)
+            _print_tables(scenario, results[-1], time.monotonic() - began)
     if as_json:
         print_json(results[0] if len(results) == 1 else results)
 
@@ -57,37 +60,42 @@ def _run(scenario: Scenario, runs: int, seed: int) -> dict[str, Any]:
 
     err = console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task(f"{scenario.key}, {runs} runs", total=1.0)
+    bar = Progress(*columns, console=err, transient=True)
+    task = bar.add_task(f"{scenario.key}, {runs} runs", total=1.0)
+    with bar if err.is_terminal else contextlib.nullcontext():
         measured = scenario.study(runs, seed, lambda share: bar.update(task, completed=share))
     return {"scenario": scenario.key, "runs": runs, "seed": seed, "figures": figures(scenario, measured)}
 
 
-def _print_table(scenario: Scenario, result: dict[str, Any], took_s: float) -> None:
+def _print_tables(scenario: Scenario, result: dict[str, Any], took_s: float) -> None:
+    """Print a table a quantity."""
     from rich.markup import escape
-    from rich.table import Table
 
-    from track_fusion.cli.output import console
+    from track_fusion.cli.output import console, grid
 
-    table = Table(title=f"{escape(scenario.key)}: {escape(scenario.title)}")
-    table.add_column("figure", no_wrap=True)
-    table.add_column("measured ± standard error", justify="right")
-    table.add_column("published", justify="right")
-    table.add_column("verdict")
-    for figure in result["figures"]:
-        error, published, verdict = (figure[name] for name in ("standard_error", "published", "verdict"))
-        measured = f"{figure['value']:.4g}" if error is None else rounded(figure["value"], error)
-        table.add_row(
-            escape(figure["name"]),
-            measured,
-            "" if published is None else f"{published:g}",
-            f"[{STYLES[verdict]}]{verdict}[/]",
-        )
     out = console()
-    out.print(table)
-    out.print(f"{result['runs']} runs, seed {result['seed']}, {took_s:.1f} s. {escape(scenario.paper)}.")
-    for assumption in scenario.assumptions:
-        out.print(f"Assumed: {escape(assumption)}.")
+    out.print(f"[bold]{escape(scenario.key)}[/bold]  {escape(scenario.title)}")
+    quantities = dict.fromkeys(f["name"].rpartition("/")[2] for f in result["figures"])
+    for quantity in quantities:
+        out.print("", _table(quantity, [f for f in result["figures"] if f["name"].rpartition("/")[2] == quantity]))
+    out.print()
+    facts = [("Runs", f"{result['runs']}, seed {result['seed']}, {took_s:.1f} s"), ("Paper", scenario.paper)]
+    out.print(grid([*facts, *(("Assumed", a) for a in scenario.assumptions)]))
+
+
+def _table(quantity: str, figures: list[dict[str, Any]]) -> Table:
+    from rich.markup import escape
+
+    from track_fusion.cli.output import table
+
+    found = table("filter and rule", "measured", "published", "verdict", title=f"{quantity}, ± standard error")
+    found.columns[1].justify = found.columns[2].justify = "right"
+    for f in figures:
+        measured = f"{f['value']:.4g}" if f["standard_error"] is None else rounded(f["value"], f["standard_error"])
+        published = "" if f["published"] is None else f"{f['published']:g}"
+        verdict = f"[{STYLES[f['verdict']]}]{f['verdict']}[/]"
+        found.add_row(escape(f["name"].rpartition("/")[0]), measured, published, verdict)
+    return found
 
 
 def rounded(value: float, error: float) -> str:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from track_fusion.rules import Rule
 
 
@@ -58,32 +60,35 @@ def facts(rule: dict[str, Any]) -> list[tuple[str, str]]:
     if rule["affine_equivariant"] is not True:
         said = rule["affine_equivariant"]
         lines.append(("Other axes or units", said if isinstance(said, str) else "give another result"))
-    return [*lines, ("Source", rule["source"]), ("Cost", rule["cost"])]
+    lines += [("Source", rule["source"]), ("Cost", rule["cost"])]
+    return lines if rule["parameters"] else [*lines, ("Parameters", "none")]
 
 
 def _print_tables(described: list[dict[str, Any]]) -> None:
     from rich.markup import escape
-    from rich.table import Table
 
-    from track_fusion.cli.output import console, shown_default
+    from track_fusion.cli.output import console, grid, table
 
     out = console()
-    summary = Table(title=f"{len(described)} fusion rules")
-    for column in ("rule", "family", "tracks", "guarantee", "source", "cost"):
-        summary.add_column(column, no_wrap=column == "rule")
+    summary = table("rule", "family", "tracks", "guarantee", title=f"{len(described)} fusion rules")
     for rule in described:
-        summary.add_row(*(escape(rule[n]) for n in ("key", "family", "arity", "guarantee", "source", "cost")))
+        summary.add_row(*(escape(rule[name]) for name in ("key", "family", "arity", "guarantee")))
     out.print(summary)
     for rule in described:
         out.print(f"\n[bold]{rule['key']}[/bold]  {escape(rule['title'])}")
-        for name, text in facts(rule):
-            out.print(f"  {name}: {escape(text)}")
-        if not rule["parameters"]:
-            out.print("  No parameters.")
-            continue
-        table = Table("parameter", "default", "value", "meaning")
-        for p in rule["parameters"]:
-            unit = f" [{p['unit']}]" if p["unit"] else ""
-            cells = (p["name"], shown_default(p["default"]), p["wanted"] + unit, p["doc"])
-            table.add_row(*(escape(cell) for cell in cells))
-        out.print(table)
+        out.print(grid(facts(rule)))
+        if rule["parameters"]:
+            out.print(_parameter_table(rule["parameters"]))
+
+
+def _parameter_table(parameters: list[dict[str, Any]]) -> Table:
+    from rich.markup import escape
+
+    from track_fusion.cli.output import shown_default, table
+
+    found = table("parameter", "default", "value", "meaning")
+    for p in parameters:
+        unit = f" [{p['unit']}]" if p["unit"] else ""
+        cells = (p["name"], shown_default(p["default"]), p["wanted"] + unit, p["doc"])
+        found.add_row(*(escape(cell) for cell in cells))
+    return found

@@ -14,7 +14,7 @@ def scenarios(as_json: bool) -> None:
 
     Example: track-fusion scenarios --json
     """
-    from track_fusion.cli.output import console, print_json
+    from track_fusion.cli.output import console, grid, print_json
     from track_fusion.scenarios import SCENARIOS
 
     names = ("key", "title", "paper", "shows", "default_runs", "published_runs", "assumptions")
@@ -25,12 +25,10 @@ def scenarios(as_json: bool) -> None:
         print_json(listed, indent=2)
         return
     from rich.markup import escape
-    from rich.table import Table
 
-    table = Table("scenario", "what it is and shows", "runs", "over ROS", show_lines=True)
-    table.columns[0].no_wrap = True
-    table.columns[2].justify = "right"
+    out = console()
     for s in listed:
-        about = f"[bold]{escape(s['title'])}[/bold]\n{escape(s['paper'])}\nShows {escape(s['shows'])}"
-        table.add_row(s["key"], about, str(s["default_runs"]), "yes" if s["over_ros"] else "no")
-    console().print(table)
+        out.print(f"[bold]{s['key']}[/bold]  {escape(s['title'])}")
+        over_ros = f"yes: track-fusion demo {s['key']}" if s["over_ros"] else "no"
+        runs = f"{s['default_runs']} by default, {s['published_runs']} in the paper"
+        out.print(grid([("Shows", s["shows"]), ("Paper", s["paper"]), ("Runs", runs), ("Over ROS", over_ros)]))
