@@ -32,6 +32,8 @@ class Example:
     not_equivariant: tuple[Values, ...] = ()
     #: whether the fusion of one track with itself is that track
     idempotent: bool = True
+    #: for a rule that samples: how far, in standard deviations, its moments vary with the random numbers
+    monte_carlo: float = 0.0
     #: (rng, tracks, count) -> (count, K n, K n): error covariances that the guarantee admits; None = every one
     joint: Callable[[np.random.Generator, SourceTracks, int], Array] | None = None
     #: for a rule whose guarantee is none or structural: the true error variance over the claimed one, and its value
@@ -58,6 +60,33 @@ def _overlapping_copies() -> tuple[float, float]:
     return 3.0 / float(fused.cov[0, 0]), 3.0 / 2.462
 
 
+def _copies_that_share_more() -> tuple[float, float]:
+    """Two copies of N(0, P), said to share N(0, 2 P) only."""
+    from track_fusion.rules import RULES
+
+    cov = np.array([[4.0, 1.0], [1.0, 2.0]])
+    common = Mixture(np.ones(1), np.zeros((1, 2)), 2.0 * cov[None])
+    tracks = SourceTracks(np.zeros((2, 2)), np.stack([cov, cov]), extras={"common": common})
+    return float(np.trace(cov) / np.trace(RULES["mixture_exact"](tracks).cov)), 1.5
+
+
+def _double_counting() -> tuple[float, float]:
+    """Two copies of N(0, P) by mixture_wep's method naive_bayes."""
+    from track_fusion.rules import RULES
+
+    cov, rule = np.array([[4.0, 1.0], [1.0, 2.0]]), RULES["mixture_wep"]
+    tracks = SourceTracks(np.zeros((2, 2)), np.stack([cov, cov]))
+    fused = rule(tracks, from_dict(rule.params, {"method": "naive_bayes"}))
+    return float(np.trace(cov) / np.trace(fused.cov)), 2.0
+
+
+def _vague_common(rng: np.random.Generator, tracks: SourceTracks) -> Mapping[str, Any]:
+    """Common information vaguer than every track, which moves with the tracks."""
+    mean, cov = tracks.mean.mean(-2), tracks.cov.sum(-3)
+    part = Mixture(np.full((*mean.shape[:-1], 2), 0.5), np.stack([mean, mean], -2), np.stack([cov, 2.0 * cov], -3))
+    return {"common": part}
+
+
 AVERAGES: tuple[Values, ...] = ({}, {"criterion": "given", "weights": EACH})
 
 EXAMPLES: dict[str, Example] = {
@@ -74,6 +103,24 @@ EXAMPLES: dict[str, Example] = {
     "mixture_average": Example(params=(*AVERAGES, {"max_components": 3}), guaranteed=AVERAGES),
     "mixture_geometric": Example(params=AVERAGES, idempotent=False, counter_example=_overlapping_copies),
     "mixture_hybrid": Example(params=AVERAGES, idempotent=False, counter_example=_overlapping_copies),
+    "mixture_wep": Example(
+        params=(
+            {"mixand_samples": 400, "samples": 4000},
+            {"method": "igs", "samples": 4000},
+            {"mixand_samples": 400, "criterion": "given", "weights": EACH},
+            {"method": "foci", "criterion": "minimax_information_loss"},
+            {"method": "pcci"},
+        ),
+        monte_carlo=0.3,
+        counter_example=_double_counting,
+    ),
+    "mixture_exact": Example(
+        params=({"mixand_samples": 400}, {"method": "igs", "samples": 2000}),
+        extras=_vague_common,
+        idempotent=False,
+        monte_carlo=0.3,
+        counter_example=_copies_that_share_more,
+    ),
 }
 
 
@@ -133,7 +180,10 @@ def arrays_of(tracks: SourceTracks) -> list[Array]:
     found = [tracks.mean, tracks.cov]
     found += [tracks.dof] if tracks.dof is not None else []
     found += list(vars(tracks.mixture).values()) if tracks.mixture is not None else []
-    return found + [v for v in tracks.extras.values() if isinstance(v, np.ndarray)]
+    for extra in tracks.extras.values():
+        found += [extra] if isinstance(extra, np.ndarray) else []
+        found += list(vars(extra).values()) if isinstance(extra, Mixture) else []
+    return found
 
 
 def select(tracks: SourceTracks, index: Any) -> SourceTracks:
@@ -146,5 +196,12 @@ def select(tracks: SourceTracks, index: Any) -> SourceTracks:
         pick(tracks.mixture.weight, 1), pick(tracks.mixture.mean, 2), pick(tracks.mixture.cov, 3)
     )
     dof = None if tracks.dof is None else pick(tracks.dof, 0)
-    extras = {k: v[index] if isinstance(v, np.ndarray) else v for k, v in tracks.extras.items()}
+    extras = {k: _select_extra(v, index) for k, v in tracks.extras.items()}
     return SourceTracks(pick(tracks.mean, 1), pick(tracks.cov, 2), dof, mixture, extras)
+
+
+def _select_extra(extra: Any, index: Any) -> Any:
+    """Index an extra like the tracks; a mixture has no axis of sources."""
+    if isinstance(extra, Mixture):
+        return extra.at(index[: extra.weight.ndim - 1])
+    return extra[index] if isinstance(extra, np.ndarray) else extra

@@ -209,3 +209,33 @@ def sample(mixture: Mixture, rng: np.random.Generator, count: int) -> Samples:
     root = np.take_along_axis(cholesky(mixture.cov), label[..., None, None], -3)
     centre = np.take_along_axis(mixture.mean, label[..., None], -2)
     return Samples(centre + matvec(root, np.broadcast_to(normal, (*lead, count, n))), label)
+
+
+# Batches of mixtures of different numbers of components.
+
+
+def chosen(take: NDArray[np.bool_], one: Mixture, other: Mixture) -> Mixture:
+    """Take, where `take` (...), the mixture `one`, else `other`; padded to the same number of components."""
+    count = max(one.count, other.count)
+    one, other = padded(one, count), padded(other, count)
+    return Mixture(
+        np.where(take[..., None], one.weight, other.weight),
+        np.where(take[..., None, None], one.mean, other.mean),
+        np.where(take[..., None, None, None], one.cov, other.cov),
+    )
+
+
+def padded(mixture: Mixture, count: int) -> Mixture:
+    """Repeat the first component, at weight 0, up to `count` components."""
+    at = np.arange(count)
+    at = np.where(at < mixture.count, at, 0)
+    weight = np.where(np.arange(count) < mixture.count, mixture.weight[..., at], 0.0)
+    return Mixture(weight, mixture.mean[..., at, :], mixture.cov[..., at, :, :])
+
+
+def same(one: Mixture, other: Mixture) -> NDArray[np.bool_]:
+    """Tell which mixtures (...) are equal, component by component; components of weight 0 do not count."""
+    count = max(one.count, other.count)
+    one, other = padded(one, count), padded(other, count)
+    shape = (one.mean == other.mean).all(-1) & (one.cov == other.cov).all((-2, -1))
+    return np.asarray(((one.weight == other.weight) & (shape | (one.weight == 0.0))).all(-1))

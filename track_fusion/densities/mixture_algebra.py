@@ -167,3 +167,21 @@ def average(parts: Mixture, weights: Array) -> Mixture:
         parts.mean.reshape(*lead, sources * count, n),
         parts.cov.reshape(*lead, sources * count, n, n),
     )
+
+
+def first_order(first: Mixture, second: Mixture, omega: Array) -> Mixture:
+    """First-order covariance intersection (FOCI) of two mixtures: Ahmed (14)-(17), (16) without the inverse.
+
+    Parameters
+    ----------
+    first, second : Mixture    (..., C1), (..., C2)
+    omega : (...)              exponent of the first, inside (0, 1)
+
+    Returns
+    -------
+    Mixture    (..., C1 C2), each pair's covariance intersection, weighted without regard to their overlap
+    """
+    parts = product(power(LogMixture.of(first), omega), power(LogMixture.of(second), 1.0 - omega))
+    share = omega[..., None, None]
+    weight = share * log_of(first.weight)[..., :, None] + (1.0 - share) * log_of(second.weight)[..., None, :]
+    return Mixture(normalised(weight.reshape(*weight.shape[:-2], first.count * second.count)), parts.mean, parts.cov)

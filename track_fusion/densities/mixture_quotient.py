@@ -37,13 +37,12 @@ class Quotient:
 
     def denominator_derivatives(self, points: Array) -> tuple[Array, Array, Array]:
         """Logarithm of u (..., S), its gradient (..., S, n) and Hessian (..., S, n, n)."""
-        value, gradient, hessian = np.float64(0.0), np.float64(0.0), np.float64(0.0)
-        for p, e in self.denominators:
-            v, g, h = p.derivatives(points)
-            value = value + e[..., None] * v
-            gradient = gradient + e[..., None, None] * g
-            hessian = hessian + e[..., None, None, None] * h
-        return np.asarray(value), np.asarray(gradient), np.asarray(hessian)
+        terms = [
+            (e[..., None] * v, e[..., None, None] * g, e[..., None, None, None] * h)
+            for (v, g, h), e in ((p.derivatives(points), e) for p, e in self.denominators)
+        ]
+        value, gradient, hessian = (sum(t[1:], t[0]) for t in zip(*terms, strict=True))
+        return value, gradient, hessian
 
     def take(self, index: NDArray[np.intp]) -> Quotient:
         """Pick mixands (..., P) by index."""
@@ -97,13 +96,14 @@ def exact_bound(quotient: Quotient, common: Mixture) -> Bound:
     half_logdet = -np.log(np.diagonal(white, axis1=-2, axis2=-1)).sum(-1)
     log_scale = 0.5 * n * LOG_2PI + half_logdet - log_of(common.weight)
     kappa = log_scale[..., None, :] + 0.5 * ((gap * gap).sum(-1) + square - logdet)
-    kappa = np.where(positive, kappa, np.inf)
+    kappa = np.where(positive, kappa, np.inf)  # also where a component of the denominator has no weight
     least = kappa.argmin(-1)[..., None]
-    sure = np.take_along_axis(positive, least, -1)[..., 0]
+    sure = np.isfinite(np.take_along_axis(kappa, least, -1)[..., 0])
     tightest = np.take_along_axis(rest, least[..., None, None], -3)[..., 0, :, :]
     safe = np.where(sure[..., None, None], tightest, np.eye(n))
     cov = symmetrise(lower @ np.linalg.solve(safe, transpose(lower)))
-    log_weight = numerator.log_weight + np.take_along_axis(kappa, least, -1)[..., 0]
+    bound = np.take_along_axis(kappa, least, -1)[..., 0]
+    log_weight = np.where(np.isfinite(numerator.log_weight), numerator.log_weight + bound, -np.inf)
     return Bound(log_weight, cov, sure)
 
 

@@ -7,8 +7,10 @@ from track_fusion.rules import (
     arithmetic_average,
     covariance_intersection,
     mixture_average,
+    mixture_exact,
     mixture_geometric,
     mixture_hybrid,
+    mixture_wep,
     naive,
 )
 from track_fusion.rules.base import FusedTracks, Mixture, Rule, SourceTracks
@@ -20,6 +22,8 @@ _MODULES = (
     mixture_average,
     mixture_geometric,
     mixture_hybrid,
+    mixture_wep,
+    mixture_exact,
 )
 
 #: Every rule by its key: what `state_fusion` may be.

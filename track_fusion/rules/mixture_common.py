@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from track_fusion.densities.mixture import Mixture, moments
 from track_fusion.densities.mixture_algebra import LogMixture, power, product
@@ -118,3 +119,71 @@ def geometric_average(tracks: SourceTracks, weights: Array, params: ReductionPar
             fused = params.reduce(product(LogMixture.of(fused), raised).normalised)
     assert fused is not None  # weights sum to 1
     return fused
+
+
+# Folding rules for two mixtures over K sources.
+
+
+class Step(NamedTuple):
+    """Two mixtures fused: the mixture (..., C) of weight 1, the weight of the first (...), diagnostics (...)."""
+
+    mixture: Mixture
+    omega: Array | None
+    info: Mapping[str, NDArray[Any]]
+
+
+#: How a diagnostic of several steps becomes that of the whole; what is not named here must hold at every step.
+JOIN: dict[str, Callable[..., NDArray[Any]]] = {
+    "iterations": np.add,
+    "log_eta": np.add,
+    "ess": np.minimum,
+    "pruned": np.maximum,
+    "skipped": np.add,
+}
+
+
+def fold_mixtures(
+    tracks: SourceTracks,
+    params: ReductionParams,
+    step: Callable[[Mixture, Mixture, int], Step],
+    info: Mapping[str, float],
+) -> FusedTracks:
+    """Fuse mixtures 1 and 2, the result and mixture 3, and so on, reducing the components each time.
+
+    Parameters
+    ----------
+    tracks : SourceTracks    K sources
+    params : ReductionParams
+    step : callable          (fused so far (..., C1), next source (..., C2), its number k) -> Step
+    info                     the diagnostics and what they are for a single source
+
+    Returns
+    -------
+    FusedTracks    weights (..., K): the product of the weights along the way, None if the steps have none
+    """
+    parts = params.sources(tracks).normalised
+    lead = tracks.mean.shape[:-2]
+    fused, weights, weighed = nth(parts, 0), np.ones((*lead, 1)), True
+    found = {name: np.full(lead, value) for name, value in info.items()}
+    for k in range(1, tracks.count):
+        result = step(fused, nth(parts, k), k)
+        fused = params.reduce(result.mixture)
+        if result.omega is None:
+            weighed = False
+        else:
+            omega = result.omega[..., None]
+            weights = np.concatenate([weights * omega, 1.0 - omega], -1)
+        for name in found:
+            found[name] = JOIN.get(name, np.logical_and)(found[name], result.info[name])
+    return fused_tracks(fused, weights if weighed else None, found)
+
+
+def seeded(tracks: SourceTracks) -> np.random.Generator:
+    """Make the generator of a rule that samples, from extras["seed"]: an int or a Generator; 0 if absent."""
+    return np.random.default_rng(tracks.extras.get("seed", 0))
+
+
+def share_of_first(given: Array, k: int) -> float:
+    """Weight of the first k sources against source k; one half where none has any."""
+    before, total = float(given[:k].sum()), float(given[: k + 1].sum())
+    return before / total if total > 0.0 else 0.5
