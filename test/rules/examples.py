@@ -80,6 +80,14 @@ def _double_counting() -> tuple[float, float]:
     return float(np.trace(cov) / np.trace(fused.cov)), 2.0
 
 
+def _few_samples() -> tuple[float, float]:
+    """Two tracks of variance 1 and of equal errors, fused from fifty samples."""
+    from track_fusion.rules import RULES
+
+    rule, tracks = RULES["geometric_mean_sampling"], SourceTracks(np.array([[0.0], [1e-9]]), np.ones((2, 1, 1)))
+    return 1.0 / float(rule(tracks, from_dict(rule.params, {"samples": 50})).cov[0, 0]), 1.0 / 0.831
+
+
 def _vague_common(rng: np.random.Generator, tracks: SourceTracks) -> Mapping[str, Any]:
     """Common information vaguer than every track, which moves with the tracks."""
     mean, cov = tracks.mean.mean(-2), tracks.cov.sum(-3)
@@ -113,6 +121,9 @@ EXAMPLES: dict[str, Example] = {
         ),
         monte_carlo=0.3,
         counter_example=_double_counting,
+    ),
+    "geometric_mean_sampling": Example(
+        params=({}, {"criterion": "given", "weights": EACH}), monte_carlo=0.3, counter_example=_few_samples
     ),
     "mixture_exact": Example(
         params=({"mixand_samples": 400}, {"method": "igs", "samples": 2000}),

@@ -6,6 +6,7 @@ from track_fusion.params import unknown_name_error
 from track_fusion.rules import (
     arithmetic_average,
     covariance_intersection,
+    geometric_mean_sampling,
     mixture_average,
     mixture_exact,
     mixture_geometric,
@@ -24,6 +25,7 @@ _MODULES = (
     mixture_hybrid,
     mixture_wep,
     mixture_exact,
+    geometric_mean_sampling,
 )
 
 #: Every rule by its key: what `state_fusion` may be.

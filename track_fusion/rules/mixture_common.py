@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.mixture import Mixture, moments
+from track_fusion.densities.mixture import Mixture, moments, same
 from track_fusion.densities.mixture_algebra import LogMixture, power, product
 from track_fusion.densities.mixture_reduction import REDUCTIONS, prune
 from track_fusion.linalg import Array, is_positive_definite
@@ -119,6 +119,22 @@ def geometric_average(tracks: SourceTracks, weights: Array, params: ReductionPar
             fused = params.reduce(product(LogMixture.of(fused), raised).normalised)
     assert fused is not None  # weights sum to 1
     return fused
+
+
+def naive_product(parts: Mixture, params: ReductionParams) -> LogMixture:
+    """Product (..., M) of K mixtures (..., K, C), brought down to `max_components` after each source."""
+    fused = LogMixture.of(nth(parts, 0))
+    for k in range(1, parts.weight.shape[-2]):
+        both = product(fused, LogMixture.of(nth(parts, k)))
+        reduced = params.reduce(both.normalised)
+        fused = LogMixture.of(reduced) if reduced.count < both.mean.shape[-2] else both
+    return fused
+
+
+def all_same(parts: Mixture) -> NDArray[np.bool_]:
+    """Tell where all K mixtures (..., K, C) are equal, (...)."""
+    first = nth(parts, 0)
+    return np.stack([same(first, nth(parts, k)) for k in range(parts.weight.shape[-2])]).all(0)
 
 
 # Folding rules for two mixtures over K sources.
