@@ -123,7 +123,9 @@ EXAMPLES: dict[str, Example] = {
         counter_example=_double_counting,
     ),
     "geometric_mean_sampling": Example(
-        params=({}, {"criterion": "given", "weights": EACH}), monte_carlo=0.3, counter_example=_few_samples
+        params=({"samples": 20000}, {"samples": 20000, "criterion": "given", "weights": EACH}),
+        monte_carlo=0.3,
+        counter_example=_few_samples,
     ),
     "mixture_exact": Example(
         params=({"mixand_samples": 400}, {"method": "igs", "samples": 2000}),

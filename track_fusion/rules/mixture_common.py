@@ -134,7 +134,10 @@ def naive_product(parts: Mixture, params: ReductionParams) -> LogMixture:
 def all_same(parts: Mixture) -> NDArray[np.bool_]:
     """Tell where all K mixtures (..., K, C) are equal, (...)."""
     first = nth(parts, 0)
-    return np.stack([same(first, nth(parts, k)) for k in range(parts.weight.shape[-2])]).all(0)
+    alike = np.ones(first.weight.shape[:-1], bool)
+    for k in range(1, parts.weight.shape[-2]):
+        alike &= same(first, nth(parts, k))
+    return alike
 
 
 # Folding rules for two mixtures over K sources.
