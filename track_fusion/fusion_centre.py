@@ -135,9 +135,9 @@ class FusionCentre:
         supported = np.full(len(fused), -1, np.int64)
         np.maximum.at(supported, target, pool.stamp_ns[members])
         changes = self._manager.commit(fused, member, fresh, supported)
-        published, confirmed = self._manager.tracks, self._manager.tracks.is_confirmed
-        if not (self.params.publish_tentative or confirmed.all()):
-            published = published[confirmed]
+        published = self._manager.tracks
+        if not (self.params.publish_tentative or published.is_confirmed.all()):
+            published = published[published.is_confirmed]
         foreign = pool.tracks.source[members] & ~_bit(source)
         taken = np.bincount(source, minlength=self._sources)
         return published, StepInfo(taken, changes, int(np.count_nonzero(foreign)), unconverged)
@@ -302,10 +302,13 @@ def predicted_to(batch: TrackBatch, time_ns: int, motion: NearlyConstantVelocity
     ------
     ValueError    a track is later than `time_ns`
     """
-    if not len(batch) or (batch.time_ns == time_ns).all():
+    if not len(batch):
         return batch
-    if (batch.time_ns == batch.time_ns[0]).all():
-        transition, noise = motion.matrices((time_ns - int(batch.time_ns[0])) / SECOND_NS)
+    first = int(batch.time_ns[0])
+    if (batch.time_ns == first).all():
+        if first == time_ns:
+            return batch
+        transition, noise = motion.matrices((time_ns - first) / SECOND_NS)
     else:
         steps = motion.batch((time_ns - batch.time_ns) / SECOND_NS)
         transition, noise = steps[0][:, None], steps[1][:, None]

@@ -73,7 +73,9 @@ def _tables(result: dict[str, Any], rules: tuple[str, ...], runs: int) -> list[T
     figures = {f["name"]: f for f in result["figures"]}
     tables = []
     for quantity, title in QUANTITIES.items():
-        table = Table(title=f"{title} (ROS and library: the same one run)", box=box.SIMPLE, pad_edge=False, padding=(0, 1, 0, 0))
+        table = Table(
+            title=f"{title} (ROS and library: the same one run)", box=box.SIMPLE, pad_edge=False, padding=(0, 1, 0, 0)
+        )
         table.add_column("", no_wrap=True)
         for column in ("ROS", "library", f"{runs} runs", "paper"):
             table.add_column(column, justify="right", no_wrap=True)
