@@ -112,13 +112,16 @@ MAX_INTERIOR = 60
 GradientHessian = Callable[[Array, NDArray[np.intp]], tuple[Array, Array]]
 
 
-def minimise_on_simplex(gradient_hessian: GradientHessian, count: int, sources: int) -> Solution:
+def minimise_on_simplex(
+    gradient_hessian: GradientHessian, count: int, sources: int, start: Array | None = None
+) -> Solution:
     """Minimise `count` convex functions on the simplex of `sources` weights by a primal-dual interior point.
 
     Parameters
     ----------
     gradient_hessian : callable    (w (b, K), rows (b,)) -> (b, K), (b, K, K)
     count, sources : int           number of functions and of weights K
+    start : (count, K) or None     positive weights of sum 1 to start from; None = equal ones
 
     Returns
     -------
@@ -128,7 +131,7 @@ def minimise_on_simplex(gradient_hessian: GradientHessian, count: int, sources: 
                   objective of a convex f exceeds its minimum by at most g'w - min g, g its gradient; that is
                   the test of convergence, or a step too short to matter where rounding hides the gap.
     """
-    weights = np.full((count, sources), 1.0 / sources)
+    weights = np.full((count, sources), 1.0 / sources) if start is None else start.copy()
     converged = np.zeros(count, bool)
     iterations = np.zeros(count, np.intp)
     rows = np.arange(count)

@@ -233,6 +233,17 @@ def padded(mixture: Mixture, count: int) -> Mixture:
     return Mixture(weight, mixture.mean[..., at, :], mixture.cov[..., at, :, :])
 
 
+def stacked(one: Mixture, other: Mixture) -> Mixture:
+    """Stack two mixtures (..., C1) and (..., C2) as sources (..., 2, C), the smaller padded."""
+    count = max(one.count, other.count)
+    pair = padded(one, count), padded(other, count)
+    return Mixture(
+        np.stack([m.weight for m in pair], -2),
+        np.stack([m.mean for m in pair], -3),
+        np.stack([m.cov for m in pair], -4),
+    )
+
+
 def same(one: Mixture, other: Mixture) -> NDArray[np.bool_]:
     """Tell which mixtures (...) are equal, component by component; components of weight 0 do not count."""
     count = max(one.count, other.count)

@@ -6,13 +6,22 @@ from track_fusion.params import unknown_name_error
 from track_fusion.rules import (
     arithmetic_average,
     covariance_intersection,
+    covariance_union,
+    cross_covariance,
+    ellipsoidal_intersection,
+    fast_covariance_intersection,
+    fault_tolerant_covariance_intersection,
+    geometric_average,
     geometric_mean_sampling,
+    harmonic_mean,
+    inverse_covariance_intersection,
     mixture_average,
     mixture_exact,
     mixture_geometric,
     mixture_hybrid,
     mixture_wep,
     naive,
+    split_covariance_intersection,
 )
 from track_fusion.rules.base import FusedTracks, Mixture, Rule, SourceTracks
 
@@ -20,12 +29,21 @@ _MODULES = (
     naive,
     covariance_intersection,
     arithmetic_average,
+    fast_covariance_intersection,
+    fault_tolerant_covariance_intersection,
+    inverse_covariance_intersection,
+    ellipsoidal_intersection,
+    covariance_union,
+    geometric_average,
+    harmonic_mean,
+    geometric_mean_sampling,
+    cross_covariance,
+    split_covariance_intersection,
     mixture_average,
     mixture_geometric,
     mixture_hybrid,
     mixture_wep,
     mixture_exact,
-    geometric_mean_sampling,
 )
 
 #: Every rule by its key: what `state_fusion` may be.

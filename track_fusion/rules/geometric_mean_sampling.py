@@ -52,7 +52,8 @@ def fuse(tracks: SourceTracks, params: GeometricMeanSamplingParams) -> FusedTrac
     Returns
     -------
     FusedTracks    mean (..., n), cov (..., n, n), weights (..., K), the mixture for mixtures; info ess (share of
-                   samples that are effective), log_eta (log of the integral of the product: very low for disjoint densities)
+                   samples that are effective), log_eta (log of the integral of the product: very low where the
+                   densities are disjoint)
 
     Raises
     ------

@@ -200,9 +200,3 @@ def fold_mixtures(
 def seeded(tracks: SourceTracks) -> np.random.Generator:
     """Make the generator of a rule that samples, from extras["seed"]: an int or a Generator; 0 if absent."""
     return np.random.default_rng(tracks.extras.get("seed", 0))
-
-
-def share_of_first(given: Array, k: int) -> float:
-    """Weight of the first k sources against source k; one half where none has any."""
-    before, total = float(given[:k].sum()), float(given[: k + 1].sum())
-    return before / total if total > 0.0 else 0.5

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from track_fusion.densities.gaussian import weighted_product
 from track_fusion.densities.log_domain import log_of, normalised
-from track_fusion.densities.mixture import Mixture, chosen, same
+from track_fusion.densities.mixture import Mixture, chosen, same, stacked
 from track_fusion.densities.mixture_algebra import LogMixture, first_order, product
 from track_fusion.densities.mixture_proposals import (
     Proposal,
@@ -23,6 +25,7 @@ from track_fusion.densities.mixture_proposals import (
 )
 from track_fusion.densities.mixture_quotient import laplace, wep_bound, wep_quotient
 from track_fusion.densities.mixture_sampling import Omega, optimise_omega, single_shot_em, weighted_em
+from track_fusion.densities.pooling_weights import chernoff_weights, minimax_weights
 from track_fusion.linalg import Array
 from track_fusion.params import param
 from track_fusion.rules import covariance_intersection
@@ -32,8 +35,8 @@ from track_fusion.rules.mixture_common import (
     Step,
     fold_mixtures,
     seeded,
-    share_of_first,
 )
+from track_fusion.rules.pairwise import share_of_first
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,6 +121,8 @@ def _fuse_pair(
     first: Mixture, second: Mixture, params: MixtureWepParams, rng: np.random.Generator, share: float | None
 ) -> Step:
     lead = first.weight.shape[:-1]
+    if first.count == second.count == 1 and params.method not in ("pcci", "naive_bayes"):
+        return _fuse_gaussians(first, second, params.criterion, share)
     given = None if share is None else np.full(lead, share)
     found = optimise_omega(first, second, rng, params.samples, params.criterion, given)
     info: dict[str, NDArray[Any]] = {
@@ -132,13 +137,40 @@ def _fuse_pair(
     # At the ends, and of equal sources, one source is the answer; 1/2 keeps the rest finite there.
     ends = (found.omega == 0.0) | (found.omega == 1.0) | same(first, second)
     inside = found._replace(omega=np.where(ends, 0.5, found.omega))
-    if first.count == second.count == 1 and params.method != "pcci":
-        fused = first_order(first, second, inside.omega)
-    else:
-        fused, more = METHODS[params.method](first, second, inside, params, rng)
-        info |= more
+    fused, more = METHODS[params.method](first, second, inside, params, rng)
+    info |= more
     fused = chosen(ends, chosen(found.omega > 0.0, first, second), fused)
     return Step(fused, None if params.method == "pcci" else found.omega, info)
+
+
+def _fuse_gaussians(first: Mixture, second: Mixture, criterion: str, share: float | None) -> Step:
+    """Fuse single components (...) exactly: the geometric average of Gaussians, without sampling."""
+    lead, n = first.weight.shape[:-1], first.mean.shape[-1]
+    both = stacked(first, second)
+    mean, cov = both.mean[..., 0, :], both.cov[..., 0, :, :]
+    converged, iterations = np.ones(lead, bool), np.zeros(lead, np.intp)
+    if share is None:
+        search = chernoff_weights if criterion == "chernoff" else minimax_weights
+        size = math.prod(lead)
+        found = search(mean.reshape(size, 2, n), cov.reshape(size, 2, n, n))
+        omega = found.weights[:, 0].reshape(lead)
+        converged, iterations = found.converged.reshape(lead), found.iterations.reshape(lead)
+    else:
+        omega = np.full(lead, share)
+    fused = weighted_product(mean, cov, np.stack([omega, 1.0 - omega], -1))
+    inside = (omega > 0.0) & (omega < 1.0)
+    middle = np.where(inside, omega, 0.5)
+    integral = product(power(LogMixture.of(first), middle), power(LogMixture.of(second), 1.0 - middle)).log_weight[
+        ..., 0
+    ]
+    info = {
+        "converged": converged,
+        "iterations": iterations,
+        "ess": np.ones(lead),
+        "log_eta": np.where(inside, integral, 0.0),
+        "pruned": np.zeros(lead),
+    }
+    return Step(Mixture(np.ones((*lead, 1)), fused[0][..., None, :], fused[1][..., None, :, :]), omega, info)
 
 
 Result = tuple[Mixture, dict[str, NDArray[Any]]]
