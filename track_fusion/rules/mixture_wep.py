@@ -160,9 +160,7 @@ def _fuse_gaussians(first: Mixture, second: Mixture, criterion: str, share: floa
     fused = weighted_product(mean, cov, np.stack([omega, 1.0 - omega], -1))
     inside = (omega > 0.0) & (omega < 1.0)
     middle = np.where(inside, omega, 0.5)
-    integral = product(power(LogMixture.of(first), middle), power(LogMixture.of(second), 1.0 - middle)).log_weight[
-        ..., 0
-    ]
+    integral = wep_bound(first, second, middle)[..., 0]
     info = {
         "converged": converged,
         "iterations": iterations,
