@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from track_fusion.densities.mixture import Mixture as Mixture
 from track_fusion.linalg import ASYMMETRY_TOLERANCE, Array, is_positive_definite, symmetrise, transpose
 from track_fusion.params import Params
 
@@ -16,15 +17,6 @@ Arity = Literal["n_ary", "pairwise"]
 #: conservative: for every admissible cross-correlation, at weights that do not depend on the means;
 #: structural: only under the correlation structure it assumes; exact: what it needs is given.
 Guarantee = Literal["conservative", "structural", "exact", "none"]
-
-
-@dataclasses.dataclass(frozen=True)
-class Mixture:
-    """A stack of Gaussian mixtures: weight (..., C), mean (..., C, n), cov (..., C, n, n)."""
-
-    weight: Array
-    mean: Array
-    cov: Array
 
 
 @dataclasses.dataclass(frozen=True)
