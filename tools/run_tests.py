@@ -265,6 +265,7 @@ def main() -> int:
     unknown = [name for name in names if name not in STAGES]
     if unknown:
         parser.error(f"no stage {', '.join(unknown)}; there are {', '.join(STAGES)}")
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what runs is ended, as on Ctrl-C
     RESULTS.mkdir(parents=True, exist_ok=True)
     counts: list[Counts] = []
     results = {name: run_stage(name, counts) for name in names}

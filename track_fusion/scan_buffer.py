@@ -105,7 +105,7 @@ class ScanBuffer:
         stamps = [s.waiting[0] for s in self._sources if s.waiting]
         if not stamps:
             return None
-        oldest, arrival, _ = min(stamps, key=lambda entry: entry[0])
+        oldest, arrival, _ = min(stamps, key=lambda entry: entry[:2])
         time_ns = max(oldest, self.fused_ns)
         overdue = now_ns - arrival >= self._params.fusion_timeout_s * SECOND_NS
         if not overdue and self._params.trigger == "all_sources" and not self._complete(time_ns, now_ns):
@@ -128,7 +128,7 @@ class ScanBuffer:
     def _complete(self, time_ns: int, now_ns: int) -> bool:
         silence = self._params.source_timeout_s * SECOND_NS
         live = [s for s in self._sources if now_ns - s.heard_ns < silence]
-        return all(s.newest_ns > time_ns or (s.newest_ns == time_ns and not s.assembles) for s in live)
+        return all(s.newest_ns >= time_ns for s in live)
 
     def silent_since(self, source: int, now_ns: int) -> float:
         """Seconds since the source was last heard (or since the first scan of any); negative: nothing yet."""

@@ -11,7 +11,7 @@ import pytest
 
 from track_fusion.linalg import Array
 from track_fusion.params import from_dict
-from track_fusion.rules import Mixture, Rule, SourceTracks
+from track_fusion.rules import FusedTracks, Mixture, Rule, SourceTracks
 
 #: Stands for one weight a source, unequal and of sum 1.
 EACH: Any = ...
@@ -32,6 +32,9 @@ class Example:
     not_equivariant: tuple[Values, ...] = ()
     #: whether the fusion of one track with itself is that track
     idempotent: bool = True
+    #: where parameters name a number of samples: how far, in standard deviations, moments may vary with the random
+    #: numbers if every sample is effective
+    monte_carlo: float = 0.0
     #: (rng, tracks, count) -> (count, K n, K n): error covariances that the guarantee admits; None = every one
     joint: Callable[[np.random.Generator, SourceTracks, int], Array] | None = None
     #: for a rule whose guarantee is none or structural: the true error variance over the claimed one, and its value
@@ -49,8 +52,52 @@ def _naive_copies() -> tuple[float, float]:
     return float(np.trace(error) / np.trace(fused.cov)), 4.0
 
 
+def _overlapping_copies() -> tuple[float, float]:
+    """Two copies of a track with components N(+-sqrt 2, 1), fused by powers of components."""
+    from track_fusion.rules import RULES
+
+    part = Mixture(np.full((2, 2), 0.5), np.full((2, 2, 1), 2**0.5) * [[1.0], [-1.0]], np.ones((2, 2, 1, 1)))
+    fused = RULES["mixture_geometric"](SourceTracks(np.zeros((2, 1)), np.full((2, 1, 1), 3.0), mixture=part))
+    return 3.0 / float(fused.cov[0, 0]), 3.0 / 2.462
+
+
+def _copies_that_share_more() -> tuple[float, float]:
+    """Two copies of N(0, P), said to share N(0, 2 P) only."""
+    from track_fusion.rules import RULES
+
+    cov = np.array([[4.0, 1.0], [1.0, 2.0]])
+    common = Mixture(np.ones(1), np.zeros((1, 2)), 2.0 * cov[None])
+    tracks = SourceTracks(np.zeros((2, 2)), np.stack([cov, cov]), extras={"common": common})
+    return float(np.trace(cov) / np.trace(RULES["mixture_exact"](tracks).cov)), 1.5
+
+
+def _double_counting() -> tuple[float, float]:
+    """Two copies of N(0, P) by mixture_wep's method naive_bayes."""
+    from track_fusion.rules import RULES
+
+    cov, rule = np.array([[4.0, 1.0], [1.0, 2.0]]), RULES["mixture_wep"]
+    tracks = SourceTracks(np.zeros((2, 2)), np.stack([cov, cov]))
+    fused = rule(tracks, from_dict(rule.params, {"method": "naive_bayes"}))
+    return float(np.trace(cov) / np.trace(fused.cov)), 2.0
+
+
+def _few_samples() -> tuple[float, float]:
+    """Two tracks of variance 1 and of equal errors, fused from fifty samples."""
+    from track_fusion.rules import RULES
+
+    rule, tracks = RULES["geometric_mean_sampling"], SourceTracks(np.array([[0.0], [1e-9]]), np.ones((2, 1, 1)))
+    return 1.0 / float(rule(tracks, from_dict(rule.params, {"samples": 50})).cov[0, 0]), 1.0 / 0.831
+
+
+def _vague_common(rng: np.random.Generator, tracks: SourceTracks) -> Mapping[str, Any]:
+    """Common information vaguer than every track, which moves with the tracks."""
+    mean, cov = tracks.mean.mean(-2), tracks.cov.sum(-3)
+    part = Mixture(np.full((*mean.shape[:-1], 2), 0.5), np.stack([mean, mean], -2), np.stack([cov, 2.0 * cov], -3))
+    return {"common": part}
+
+
 def _diagonal_pair(key: str, ratio: float, values: Values, cross: Array) -> float:
-    """Fuse diag(1, r) and diag(r, 1); return error variance over claim along (1, 1), at this cross-covariance."""
+    """Fuse diag(1, r) and diag(r, 1); return the error variance over the claim, along (1, 1), at this correlation."""
     from track_fusion.rules import RULES
 
     rule, cov = RULES[key], np.stack([np.diag([1.0, ratio]), np.diag([ratio, 1.0])])
@@ -163,6 +210,25 @@ def joint_covariances(rng: np.random.Generator, cov: Array, count: int) -> Array
 GIVEN: Values = {"criterion": "given", "weights": EACH}
 TRACE: Values = {"criterion": "trace"}
 UNIFORM: Values = {"criterion": "uniform"}
+AVERAGES: tuple[Values, ...] = ({}, GIVEN)
+
+
+def _shared_error(key: str, stated: float) -> Callable[[], tuple[float, float]]:
+    """Three scalar tracks of variance 1: an error of 10 that a random pair shares in 1.5 % of all cases."""
+
+    def ratio() -> tuple[float, float]:
+        from track_fusion.rules import RULES
+
+        error, chance = np.array([10.0, 0.0]), np.array([0.015, 0.985])
+        mean = error[:, None, None] * np.array([1.0, 1.0, 0.0])[:, None]
+        assert chance @ (error**2 * 2.0 / 3.0) == pytest.approx(1.0)  # the variance of each track, over all pairs
+        fused = RULES[key](SourceTracks(mean, np.ones((2, 3, 1, 1))))
+        return float(chance @ fused.mean[:, 0] ** 2 / (chance @ fused.cov[:, 0, 0])), stated
+
+    return ratio
+
+
+_GENERALIZED: Values = {"family": "generalized_gaussian", "beta": 0.7}
 
 EXAMPLES: dict[str, Example] = {
     "naive": Example(idempotent=False, counter_example=_naive_copies),
@@ -198,8 +264,34 @@ EXAMPLES: dict[str, Example] = {
         guaranteed=(UNIFORM, GIVEN),
         extras=_target_and_likelihood,
     ),
+    "mixture_average": Example(params=(*AVERAGES, {"max_components": 3}), guaranteed=AVERAGES),
+    "mixture_geometric": Example(params=AVERAGES, idempotent=False, counter_example=_overlapping_copies),
+    "mixture_hybrid": Example(params=AVERAGES, idempotent=False, counter_example=_overlapping_copies),
+    "mixture_wep": Example(
+        params=(
+            {"mixand_samples": 400, "samples": 4000},
+            {"method": "igs", "samples": 4000},
+            {"mixand_samples": 400, "criterion": "given", "weights": EACH},
+            {"method": "foci", "criterion": "minimax_information_loss", "samples": 4000},
+            {"method": "pcci"},
+        ),
+        monte_carlo=0.3,
+        counter_example=_double_counting,
+    ),
+    "geometric_mean_sampling": Example(
+        params=({"samples": 5000}, {**GIVEN, "samples": 5000}),
+        monte_carlo=0.15,
+        counter_example=_few_samples,
+    ),
+    "mixture_exact": Example(
+        params=({"mixand_samples": 400}, {"method": "igs", "samples": 2000}),
+        extras=_vague_common,
+        idempotent=False,
+        monte_carlo=0.3,
+        counter_example=_copies_that_share_more,
+    ),
     "harmonic_mean": Example(
-        params=({}, TRACE, GIVEN), not_equivariant=(TRACE,),
+        params=({}, TRACE, GIVEN, {"method": "sampling", "samples": 5000}), not_equivariant=(TRACE,), monte_carlo=0.15,
         counter_example=lambda: (scalar_nees((1.0, 10.0), 0.9, {}), 1.09),
     ),
     "cross_covariance": Example(
@@ -210,7 +302,28 @@ EXAMPLES: dict[str, Example] = {
         params=({}, TRACE, UNIFORM, GIVEN), guaranteed=({}, TRACE, UNIFORM, GIVEN), idempotent=False,
         not_equivariant=(TRACE,), extras=_independent_parts, joint=_split_joint,
     ),
+    "mhdp_explicit": Example(
+        params=({}, {"criterion": "unsquared"}, _GENERALIZED), counter_example=_shared_error("mhdp_explicit", 1.36)
+    ),
+    "mhdp_iterative": Example(
+        params=({}, {"criterion": "unsquared"}, {"scatter": "intersection"}, _GENERALIZED),
+        counter_example=_shared_error("mhdp_iterative", 1.36),
+    ),
+    "quasi_minimal_manhattan": Example(
+        params=({}, _GENERALIZED), counter_example=_shared_error("quasi_minimal_manhattan", 1.26)
+    ),
+    "geodesic_projection": Example(
+        params=({}, {"family": "student_t"}, _GENERALIZED), counter_example=_shared_error("geodesic_projection", 1.42)
+    ),
 }  # fmt: skip
+
+
+def tolerance_of(rule: Rule, values: Values, fused: FusedTracks, exact: float) -> Array:
+    """Tolerance of a law for each fusion of a batch: `exact`, unless these parameters make the rule sample."""
+    if not any("samples" in name for name in values):
+        return np.full(fused.mean.shape[:-1], exact)
+    effective = np.asarray(fused.info.get("ess", np.ones(fused.mean.shape[:-1])))
+    return np.maximum(exact, example_of(rule).monte_carlo / np.sqrt(effective))
 
 
 def example_of(rule: Rule) -> Example:

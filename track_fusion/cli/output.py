@@ -61,7 +61,7 @@ def plain(value: Any) -> Any:
 
 def print_json(value: Any, *, indent: int | None = None) -> None:
     """Print valid JSON: no NaN, no Infinity."""
-    click.echo(json.dumps(plain(value), indent=indent, allow_nan=False, ensure_ascii=False))
+    click.echo(json.dumps(plain(value), indent=indent, allow_nan=False))
 
 
 def parameters(params: Any) -> list[dict[str, Any]]:

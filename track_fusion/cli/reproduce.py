@@ -77,7 +77,8 @@ def _print_tables(scenario: Scenario, result: dict[str, Any], took_s: float) -> 
     out.print(f"[bold]{escape(scenario.key)}[/bold]  {escape(scenario.title)}")
     quantities = dict.fromkeys(f["name"].rpartition("/")[2] for f in result["figures"])
     for quantity in quantities:
-        out.print("", _table(quantity, [f for f in result["figures"] if f["name"].rpartition("/")[2] == quantity]), "")
+        out.print("", _table(quantity, [f for f in result["figures"] if f["name"].rpartition("/")[2] == quantity]))
+    out.print()
     facts = [("Runs", f"{result['runs']}, seed {result['seed']}, {took_s:.1f} s"), ("Paper", scenario.paper)]
     out.print(grid([*facts, *(("Assumed", a) for a in scenario.assumptions)]))
 

@@ -30,6 +30,8 @@ from track_fusion.nodes.ros_params import declare, refuse_unknown
 from track_fusion.params import ParameterError, Params, param
 
 DIAGNOSTICS_PERIOD_S = 1.0
+#: A signal takes effect on the context within this time.
+SIGNAL_LAG_S = 0.5
 #: How often a held-back message looks whether the clock and the subscribers are there.
 LOOK_PERIOD_S = 0.02
 #: So many messages are held back at most; later ones are rejected.
@@ -171,6 +173,8 @@ class ManagedNode(LifecycleNode):
                 self.log.error(str(error))
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
+            if not rclpy.utilities.ok():  # a signal has come meanwhile
+                return TransitionCallbackReturn.FAILURE
             self.log.error(f"{error}\n{traceback.format_exc()}")
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
@@ -262,7 +266,9 @@ class ManagedNode(LifecycleNode):
     def reject(self, reasons: dict[str, int] | Counter[str], text: str = "") -> None:
         """Count rejected messages or tracks by reason, and log the first of each kind."""
         for reason, count in reasons.items():
-            if count and not self.rejected[reason]:
+            if not count:
+                continue
+            if not self.rejected[reason]:
                 self.log.warning(f"Rejected ({reason}): {text or 'see /diagnostics for the count'}")
             self.rejected[reason] += count
 
@@ -303,15 +309,23 @@ def run(make: Callable[[], ManagedNode]) -> int:
         pass
     except ParameterError as error:
         return _failed(str(error), 2)
-    except Fault as error:
-        return _failed(str(error), 1)
-    except Exception:
-        if rclpy.utilities.ok():
-            raise
-        # A signal came while the node was being built: what it built upon is gone.
+    except Exception as error:
+        # When a signal comes while the node is being built or waits, what it builds upon is gone; that is no fault.
+        if not _ending():
+            if not isinstance(error, Fault):
+                raise
+            return _failed(str(error), 1)
     finally:
         _close(node)
     return 0
+
+
+def _ending() -> bool:
+    """Tell whether a signal is ending this process: its errors may be seen a little before the context says so."""
+    deadline = time.monotonic() + SIGNAL_LAG_S
+    while rclpy.utilities.ok() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return not rclpy.utilities.ok()
 
 
 def _failed(text: str, code: int) -> int:

@@ -84,9 +84,11 @@ class SensorTrackerNode(ManagedNode):
 
     def _on_feedback(self, msg: Any) -> None:
         now = self.now_ns()
-        check_header(msg.header, frame_id=self.frame.frame_id, now_ns=now, max_future_ns=self.frame.max_future_ns)
+        stamp_ns = check_header(
+            msg.header, frame_id=self.frame.frame_id, now_ns=now, max_future_ns=self.frame.max_future_ns
+        )
         batch = screened_tracks(self, track_table_from_msg(msg), self.tracker.layout)
-        if len(batch) and int(batch.time_ns[0]) != self._awaited_ns:
+        if stamp_ns != self._awaited_ns:  # of an empty table, too: it says that there is no feedback of its time only
             self.counted["feedback_of_another_time"] += 1
             return
         self.counted["feedback"] += self.tracker.feed_back(batch)

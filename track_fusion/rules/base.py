@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from track_fusion.densities.mixture import Mixture as Mixture
 from track_fusion.linalg import ASYMMETRY_TOLERANCE, Array, is_positive_definite, symmetrise, transpose
 from track_fusion.params import Params
 
@@ -16,15 +17,6 @@ Arity = Literal["n_ary", "pairwise"]
 #: conservative: for every admissible cross-correlation, at weights that do not depend on the means;
 #: structural: only under the correlation structure it assumes; exact: what it needs is given.
 Guarantee = Literal["conservative", "structural", "exact", "none"]
-
-
-@dataclasses.dataclass(frozen=True)
-class Mixture:
-    """A stack of Gaussian mixtures: weight (..., C), mean (..., C, n), cov (..., C, n, n)."""
-
-    weight: Array
-    mean: Array
-    cov: Array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,6 +85,7 @@ class Rule:
     needs_when: tuple[tuple[str, str, str], ...] = ()
     optional: tuple[str, ...] = ()  # names of `extras` that are used when given
     affine_equivariant: bool | str = True  # a string says why not, or under which parameters
+    linear: bool = False  # the fused mean is linear in the means; all else depends on the covariances alone
 
     def __call__(self, tracks: SourceTracks, params: Params | None = None) -> FusedTracks:
         """Check the tracks, then fuse them; `fuse` alone trusts them, for callers that screened them before.

@@ -57,7 +57,8 @@ def fold(tracks: SourceTracks, kernel: PairKernel, given: Array | None = None) -
     mean, cov, weights = means[:, 0].copy(), covs[:, 0].copy(), np.ones((len(means), 1))
     converged, iterations, searched, weighed = np.ones(len(means), bool), np.zeros(len(means), np.intp), False, True
     for k in range(1, count):
-        step = _in_pieces(kernel, mean, cov, means[:, k], covs[:, k], None if given is None else _share(given, k))
+        share = None if given is None else share_of_first(given, k)
+        step = _in_pieces(kernel, mean, cov, means[:, k], covs[:, k], share)
         mean, cov = step.mean, step.cov
         if step.omega is None:
             weighed = False
@@ -81,7 +82,7 @@ def _in_pieces(kernel: PairKernel, x1: Array, p1: Array, x2: Array, p2: Array, g
     return PairFusion.concatenate([kernel(x1[s], p1[s], x2[s], p2[s], given) for s in pieces])
 
 
-def _share(given: Array, k: int) -> float:
+def share_of_first(given: Array, k: int) -> float:
     """Weight of the first k tracks against track k; one half where none has any."""
     before, total = float(given[:k].sum()), float(given[: k + 1].sum())
     return before / total if total > 0 else 0.5

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -11,11 +11,11 @@ from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate, armse
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
-from track_fusion.rules import RULES, SourceTracks
+from track_fusion.rules import RULES
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.naive import NaiveParams
-from track_fusion.scenarios.base import RuleChoice, Scenario, Tracking
+from track_fusion.scenarios.base import RuleChoice, Scenario, Tracking, fuse_runs
 from track_fusion.tracks import planar_layout
 
 #: Table I: ARMSE of position (m) and velocity (m/s).
@@ -59,35 +59,37 @@ def study(runs: int, seed: int, progress: Callable[[float], None]) -> dict[str, 
     -------
     {figure name: Estimate}, names like kf-alone/position_armse_m
     """
-    truth = np.stack([TRACKING.truth(seed, run) for run in range(runs)])
-    drawn = [TRACKING.measurements(truth[run], seed, run) for run in range(runs)]
+    return {name: armse(squares) for name, squares in squared_errors(range(runs), seed, progress).items()}
+
+
+def squared_errors(runs: Sequence[int], seed: int, progress: Callable[[float], None]) -> dict[str, Array]:
+    """Run every row of Table I over these Monte Carlo runs: {figure name: squared norm of the error (R, T)}."""
+    truth = TRACKING.truths(seed, runs)
+    drawn = [TRACKING.measurements(states, seed, run) for states, run in zip(truth, runs, strict=True)]
     seen = [np.stack([d[name] for d in drawn]) for name in TRACKING.sensors]
-    rows: dict[str, Callable[[], Iterator[Array]]] = {
-        "kf-alone": lambda: _one_filter(seen[:1], runs),
-        "kf-ic": lambda: _one_filter(seen, runs),
-    }
-    for choice in RULE_CHOICES:
-        rows[f"kf-{choice.name}"] = lambda choice=choice: _fused(choice, seen, runs)  # type: ignore[misc]
-    measured: dict[str, Estimate] = {}
+    rows = {"kf-alone": one_filter(seen[:1]), "kf-ic": one_filter(seen)}
+    rows |= {f"kf-{choice.name}": fused_filters(choice, seen) for choice in RULE_CHOICES}
+    squares: dict[str, Array] = {}
     for done, (row, estimates) in enumerate(rows.items()):
-        squares = np.empty((2, runs, TRACKING.steps))
-        for k, mean in enumerate(estimates()):
-            error = mean - truth[:, k + 1]
-            squares[0, :, k], squares[1, :, k] = (error[:, :2] ** 2).sum(1), (error[:, 2:] ** 2).sum(1)
+        names = [f"{row}/{quantity}" for quantity in QUANTITIES]
+        squares |= {name: np.empty((len(runs), TRACKING.steps)) for name in names}
+        for k, mean in enumerate(estimates):
+            squared = (mean - truth[:, k + 1]) ** 2
+            for name, part in zip(names, (squared[:, :2], squared[:, 2:]), strict=True):
+                squares[name][:, k] = part.sum(1)
             progress((done + (k + 1) / TRACKING.steps) / len(rows))
-        measured |= {f"{row}/{q}": armse(s) for q, s in zip(QUANTITIES, squares, strict=True)}
-    return measured
+    return squares
 
 
 def _start(runs: int) -> tuple[Array, Array]:
-    mean, cov = TRACKING.initial_mean, TRACKING.initial_cov
-    return np.tile(mean, (runs, 1)), np.tile(cov, (runs, 1, 1))
+    """State of all runs, (R, n), and its covariance, (1, n, n), which they share as long as it depends on no data."""
+    return np.tile(TRACKING.initial_mean, (runs, 1)), TRACKING.initial_cov[None]
 
 
-def _one_filter(seen: list[Array], runs: int) -> Iterator[Array]:
-    """One filter that uses the measurements of the given sensors jointly."""
+def one_filter(seen: list[Array]) -> Iterator[Array]:
+    """One filter that uses the measurements of the given sensors, (R, T, m) each, jointly."""
     sensors = list(TRACKING.sensors.values())[: len(seen)]
-    mean, cov = _start(runs)
+    mean, cov = _start(len(seen[0]))
     for k in range(TRACKING.steps):
         mean, cov = predict(mean, cov, *TRACKING.motion.matrices(TRACKING.dt_s))
         z = [s[:, k] for s in seen]
@@ -95,16 +97,15 @@ def _one_filter(seen: list[Array], runs: int) -> Iterator[Array]:
         yield mean
 
 
-def _fused(choice: RuleChoice, seen: list[Array], runs: int) -> Iterator[Array]:
+def fused_filters(choice: RuleChoice, seen: list[Array]) -> Iterator[Array]:
     """One filter a sensor, fused after each step, the fused posterior fed back to all of them."""
     rule, sensors = RULES[choice.key], list(TRACKING.sensors.values())
-    mean, cov = _start(runs)
+    mean, cov = _start(len(seen[0]))
     for k in range(TRACKING.steps):
         mean, cov = predict(mean, cov, *TRACKING.motion.matrices(TRACKING.dt_s))
         local = [update(mean, cov, z[:, k], s.matrix, s.noise)[:2] for z, s in zip(seen, sensors, strict=True)]
-        tracks = SourceTracks(np.stack([m for m, _ in local], 1), np.stack([c for _, c in local], 1))
-        fused = rule.fuse(tracks, choice.params)
-        mean, cov = fused.mean, fused.cov
+        means, covs = (np.stack(parts, 1) for parts in zip(*local, strict=True))
+        mean, cov = fuse_runs(rule, choice.params, means, covs)
         yield mean
 
 
