@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
 
 Array = NDArray[np.float64]
 
@@ -43,6 +45,30 @@ def covariance_intersection_slsqp(means: Array, covs: Array) -> tuple[Array, Arr
 def lapack_floor(p1: Array, p2: Array) -> tuple[Array, Array, Array]:
     """One batched Cholesky, eigh and inverse of the arrays of a batch of pairs: what no kernel can do without."""
     return np.linalg.cholesky(p1 + p2), np.linalg.eigh(p1)[0], np.linalg.inv(p2)
+
+
+def karcher_pyriemann(groups: Array) -> list[Array]:
+    """Riemannian mean of each group of covariances, (B, K, n, n): a loop over pyriemann, its defaults."""
+    from pyriemann.utils.mean import mean_riemann
+
+    return [mean_riemann(covs) for covs in groups]
+
+
+def log_euclidean_pyriemann(groups: Array) -> list[Array]:
+    """Log-Euclidean mean of each group of covariances, (B, K, n, n): a loop over pyriemann."""
+    from pyriemann.utils.mean import mean_logeuclid
+
+    return [mean_logeuclid(covs) for covs in groups]
+
+
+def mhdp_mean_minimize(means: Array, covs: Array, pull: float) -> Array:
+    """Mean of MHDP, squared criterion: one scipy.optimize.minimize over a function with np.linalg.inv."""
+    infos = [np.linalg.inv(p) for p in covs]
+
+    def cost(x: Array) -> float:
+        return float(sum(np.arccosh(1 + pull * (x - m) @ i @ (x - m)) ** 2 for m, i in zip(means, infos, strict=True)))
+
+    return minimize(cost, means.mean(0)).x
 
 
 def association_costs_by_loop(row_mean: Array, row_cov: Array, col_mean: Array, col_cov: Array, gamma: float) -> Array:
@@ -88,3 +114,35 @@ def two_filters_and_intersection_looped(
 
 def _fused_trace(w: float, i1: Array, i2: Array) -> float:
     return float(np.trace(np.linalg.inv(w * i1 + (1 - w) * i2)))
+
+
+def mixture_log_pdf_loop(weight: Array, mean: Array, cov: Array, points: Array) -> Array:
+    """Log-density of a mixture: one scipy call a component."""
+    parts = zip(weight, mean, cov, strict=True)
+    return logsumexp([np.log(w) + multivariate_normal.logpdf(points, m, c) for w, m, c in parts], axis=0)
+
+
+def runnalls_loop(weight: Array, mean: Array, cov: Array, count: int) -> tuple[list[float], list[Array], list[Array]]:
+    """Merge the cheapest pair until `count` are left: the cost of every pair anew at every step."""
+    weights, means, covs = list(weight), list(mean), list(cov)
+
+    def merged(i: int, j: int) -> tuple[float, Array, Array]:
+        w, d = weights[i] + weights[j], means[i] - means[j]
+        m = (weights[i] * means[i] + weights[j] * means[j]) / w
+        p = (weights[i] * covs[i] + weights[j] * covs[j]) / w + weights[i] * weights[j] / w**2 * np.outer(d, d)
+        return w, m, p
+
+    def cost(i: int, j: int) -> float:
+        w, _, p = merged(i, j)
+        return 0.5 * float(
+            w * np.log(np.linalg.det(p))
+            - weights[i] * np.log(np.linalg.det(covs[i]))
+            - weights[j] * np.log(np.linalg.det(covs[j]))
+        )
+
+    while len(weights) > count:
+        pairs = ((i, j) for i in range(len(weights)) for j in range(i + 1, len(weights)))
+        i, j = min(pairs, key=lambda pair: cost(*pair))
+        weights[i], means[i], covs[i] = merged(i, j)
+        del weights[j], means[j], covs[j]
+    return weights, means, covs

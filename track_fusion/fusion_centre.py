@@ -14,7 +14,7 @@ from track_fusion.chi_square import chi_square_quantile
 from track_fusion.filters.kalman import predict
 from track_fusion.linalg import Array, is_positive_definite
 from track_fusion.models.motion import NearlyConstantVelocity
-from track_fusion.params import Params, param
+from track_fusion.params import ParameterError, Params, param
 from track_fusion.rules import RULES, FusedTracks, Mixture, Rule, SourceTracks
 from track_fusion.track_manager import Bools, Changes, TrackManager, TrackManagerParams
 from track_fusion.tracks import COASTED, CONFIRMED, TrackBatch
@@ -76,6 +76,10 @@ class FusionCentre:
     params : FusionCentreParams
     rule_params : Params               of the rule `params.state_fusion`; None = its defaults
     manager_params : TrackManagerParams
+
+    Raises
+    ------
+    ParameterError    the rule needs what source tracks do not bring, such as their cross-covariance
     """
 
     def __init__(
@@ -91,6 +95,11 @@ class FusionCentre:
         self.layout, self.frame_id, self._motion = motion.layout, frame_id, motion
         self.rule: Rule = RULES[params.state_fusion]
         self._rule_params = self.rule.params() if rule_params is None else rule_params
+        if needed := self.rule.needed(self._rule_params):
+            raise ParameterError(
+                f"The 'state_fusion' parameter must be a rule that needs only tracks. Got '{self.rule.key}', "
+                f"which at these parameters needs {', '.join(needed)}: use it in the library or by track-fusion fuse."
+            )
         self._manager_params = manager_params or TrackManagerParams()
         self._gamma = chi_square_quantile(params.gate_probability, self.layout.size)
         self._sources = sources

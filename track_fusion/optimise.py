@@ -106,6 +106,8 @@ def minimise_one(derivatives: ScalarDerivatives) -> tuple[float, bool, int]:
 GAP = 1e-12
 #: Weights this small whose multiplier says that they vanish are set to zero.
 VANISHING = 1e-7
+#: What is left of a vanishing multiplier, relative to the gradient: rounding of the Hessian.
+FLOOR = 1e-14
 MAX_INTERIOR = 60
 
 #: w (b, K), rows (b,) -> gradient (b, K) and Hessian (b, K, K) of a convex function.
@@ -169,7 +171,8 @@ def _interior_step(
     kkt = np.ones((len(w), sources + 1, sources + 1))
     kkt[:, :sources, :sources] = hessian
     diagonal = np.arange(sources)
-    kkt[:, diagonal, diagonal] += z / w
+    # The floor keeps a row solvable whose tracks are all equal: no multiplier, and any weights do.
+    kkt[:, diagonal, diagonal] += np.maximum(z / w, FLOOR * scale[:, None])
     kkt[:, sources, sources] = 0.0
     right = np.zeros((len(w), sources + 1))
     right[:, :sources] = centre - gradient

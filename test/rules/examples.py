@@ -212,6 +212,24 @@ TRACE: Values = {"criterion": "trace"}
 UNIFORM: Values = {"criterion": "uniform"}
 AVERAGES: tuple[Values, ...] = ({}, GIVEN)
 
+
+def _shared_error(key: str, stated: float) -> Callable[[], tuple[float, float]]:
+    """Three scalar tracks of variance 1: an error of 10 that a random pair shares in 1.5 % of all cases."""
+
+    def ratio() -> tuple[float, float]:
+        from track_fusion.rules import RULES
+
+        error, chance = np.array([10.0, 0.0]), np.array([0.015, 0.985])
+        mean = error[:, None, None] * np.array([1.0, 1.0, 0.0])[:, None]
+        assert chance @ (error**2 * 2.0 / 3.0) == pytest.approx(1.0)  # the variance of each track, over all pairs
+        fused = RULES[key](SourceTracks(mean, np.ones((2, 3, 1, 1))))
+        return float(chance @ fused.mean[:, 0] ** 2 / (chance @ fused.cov[:, 0, 0])), stated
+
+    return ratio
+
+
+_GENERALIZED: Values = {"family": "generalized_gaussian", "beta": 0.7}
+
 EXAMPLES: dict[str, Example] = {
     "naive": Example(idempotent=False, counter_example=_naive_copies),
     "covariance_intersection": Example(
@@ -283,6 +301,19 @@ EXAMPLES: dict[str, Example] = {
     "split_covariance_intersection": Example(
         params=({}, TRACE, UNIFORM, GIVEN), guaranteed=({}, TRACE, UNIFORM, GIVEN), idempotent=False,
         not_equivariant=(TRACE,), extras=_independent_parts, joint=_split_joint,
+    ),
+    "mhdp_explicit": Example(
+        params=({}, {"criterion": "unsquared"}, _GENERALIZED), counter_example=_shared_error("mhdp_explicit", 1.36)
+    ),
+    "mhdp_iterative": Example(
+        params=({}, {"criterion": "unsquared"}, {"scatter": "intersection"}, _GENERALIZED),
+        counter_example=_shared_error("mhdp_iterative", 1.36),
+    ),
+    "quasi_minimal_manhattan": Example(
+        params=({}, _GENERALIZED), counter_example=_shared_error("quasi_minimal_manhattan", 1.26)
+    ),
+    "geodesic_projection": Example(
+        params=({}, {"family": "student_t"}, _GENERALIZED), counter_example=_shared_error("geodesic_projection", 1.42)
     ),
 }  # fmt: skip
 
