@@ -41,6 +41,26 @@ def inverse(cov: Array) -> Array:
     return symmetrise(np.asarray(np.linalg.inv(cov), np.float64))
 
 
+def solve(a: Array, b: Array) -> Array:
+    """Return A^-1 B, (..., n, n), (..., n, k) -> (..., n, k).
+
+    Raises
+    ------
+    LinAlgError    a matrix is singular
+    """
+    return np.asarray(np.linalg.solve(a, b), np.float64)
+
+
+def cholesky(cov: Array) -> Array:
+    """Lower triangular root of positive definite matrices, (..., n, n).
+
+    Raises
+    ------
+    LinAlgError    a matrix is not positive definite
+    """
+    return np.asarray(np.linalg.cholesky(cov), np.float64)
+
+
 def logdet(cov: Array) -> Array:
     """Log-determinant of positive definite matrices, (..., n, n) -> (...)."""
     diagonal = np.diagonal(np.linalg.cholesky(cov), axis1=-2, axis2=-1)

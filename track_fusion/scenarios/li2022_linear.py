@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
 from track_fusion.filters.kalman import predict, update, update_joint
 from track_fusion.linalg import Array
-from track_fusion.metrics.accuracy import Estimate, armse
+from track_fusion.metrics.accuracy import Estimate
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.rules import RULES, SourceTracks
@@ -16,6 +17,7 @@ from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.naive import NaiveParams
 from track_fusion.scenarios.base import RuleChoice, Scenario, Tracking
+from track_fusion.scenarios.one_target import Quantity, Row, Sample, Sir, measured, sir_alone, sir_fused, start
 from track_fusion.tracks import planar_layout
 
 #: Table I: ARMSE of position (m) and velocity (m/s).
@@ -25,8 +27,15 @@ TABLE_1 = {
     "kf-naive": (39.99, 13.32),
     "kf-arithmetic_average": (18.57, 10.91),
     "kf-covariance_intersection": (18.85, 10.70),
+    "sir-alone": (22.90, 11.74),
+    "sir-ic": (20.62, 11.36),
+    "sir-naive": (66.07, 16.16),
+    "sir-arithmetic_average": (19.55, 11.30),
+    "sir-covariance_intersection": (20.76, 11.23),
 }
-QUANTITIES = ("position_armse_m", "velocity_armse_mps")
+LAYOUT = planar_layout()
+QUANTITIES = {"position_armse_m": Quantity(LAYOUT.position), "velocity_armse_mps": Quantity(LAYOUT.velocity)}
+SIR = Sir(200)
 
 RULE_CHOICES = (
     RuleChoice("naive", NaiveParams()),
@@ -36,20 +45,16 @@ RULE_CHOICES = (
 )
 
 
-def _tracking() -> Tracking:
-    layout = planar_layout()
-    motion = NearlyConstantVelocity(layout, MotionParams(noise_form="piecewise_constant", process_noise=5.0))
-    return Tracking(
-        motion=motion,
-        dt_s=1.0,
-        steps=100,
-        initial_mean=np.array([1000.0, 1000.0, 20.0, 0.0]),
-        initial_cov=np.diag([500.0, 500.0, 50.0, 50.0]),
-        sensors={"sensor_1": LinearSensor.position(layout, 20.0), "sensor_2": LinearSensor.position(layout, 40.0)},
-    )
-
-
-TRACKING = _tracking()
+MOTION = NearlyConstantVelocity(LAYOUT, MotionParams(noise_form="piecewise_constant", process_noise=5.0))
+SENSORS = {"sensor_1": LinearSensor.position(LAYOUT, 20.0), "sensor_2": LinearSensor.position(LAYOUT, 40.0)}
+TRACKING = Tracking(
+    motion=MOTION,
+    dt_s=1.0,
+    steps=100,
+    initial_mean=np.array([1000.0, 1000.0, 20.0, 0.0]),
+    initial_cov=np.diag([500.0, 500.0, 50.0, 50.0]),
+    sensors=SENSORS,
+)
 
 
 def study(runs: int, seed: int, progress: Callable[[float], None]) -> dict[str, Estimate]:
@@ -59,48 +64,45 @@ def study(runs: int, seed: int, progress: Callable[[float], None]) -> dict[str, 
     -------
     {figure name: Estimate}, names like kf-alone/position_armse_m
     """
-    truth = np.stack([TRACKING.truth(seed, run) for run in range(runs)])
-    drawn = [TRACKING.measurements(truth[run], seed, run) for run in range(runs)]
-    seen = [np.stack([d[name] for d in drawn]) for name in TRACKING.sensors]
-    rows: dict[str, Callable[[], Iterator[Array]]] = {
-        "kf-alone": lambda: _one_filter(seen[:1], runs),
-        "kf-ic": lambda: _one_filter(seen, runs),
-    }
+    return measured(TRACKING, rows(), QUANTITIES, runs, seed, progress)
+
+
+def rows() -> dict[str, Row]:
+    """Every row of Table I."""
+    table = {"kf-alone": Row(lambda s: _one_filter(s.seen[:1], len(s.runs)))}
+    table["kf-ic"] = Row(lambda s: _one_filter(s.seen, len(s.runs)))
     for choice in RULE_CHOICES:
-        rows[f"kf-{choice.name}"] = lambda choice=choice: _fused(choice, seen, runs)  # type: ignore[misc]
-    measured: dict[str, Estimate] = {}
-    for done, (row, estimates) in enumerate(rows.items()):
-        squares = np.empty((2, runs, TRACKING.steps))
-        for k, mean in enumerate(estimates()):
-            error = mean - truth[:, k + 1]
-            squares[0, :, k], squares[1, :, k] = (error[:, :2] ** 2).sum(1), (error[:, 2:] ** 2).sum(1)
-            progress((done + (k + 1) / TRACKING.steps) / len(rows))
-        measured |= {f"{row}/{q}": armse(s) for q, s in zip(QUANTITIES, squares, strict=True)}
-    return measured
+        table[f"kf-{choice.name}"] = Row(partial(_fused_of, choice))
+    table |= {"sir-alone": sir_alone(TRACKING, SIR, 1), "sir-ic": sir_alone(TRACKING, SIR, 2)}
+    for choice in RULE_CHOICES:
+        averaged = choice.key == "arithmetic_average"
+        table[f"sir-{choice.name}"] = sir_fused(TRACKING, SIR, choice, union=averaged)
+        if averaged:
+            table[f"sir-{choice.name}@gaussian"] = sir_fused(TRACKING, SIR, choice)
+    return table
 
 
-def _start(runs: int) -> tuple[Array, Array]:
-    mean, cov = TRACKING.initial_mean, TRACKING.initial_cov
-    return np.tile(mean, (runs, 1)), np.tile(cov, (runs, 1, 1))
+def _fused_of(choice: RuleChoice, sample: Sample) -> Iterator[Array]:
+    return _fused(choice, sample.seen, len(sample.runs))
 
 
-def _one_filter(seen: list[Array], runs: int) -> Iterator[Array]:
+def _one_filter(seen: Sequence[Array], runs: int) -> Iterator[Array]:
     """One filter that uses the measurements of the given sensors jointly."""
-    sensors = list(TRACKING.sensors.values())[: len(seen)]
-    mean, cov = _start(runs)
+    sensors = list(SENSORS.values())[: len(seen)]
+    mean, cov = start(TRACKING, runs)
     for k in range(TRACKING.steps):
-        mean, cov = predict(mean, cov, *TRACKING.motion.matrices(TRACKING.dt_s))
+        mean, cov = predict(mean, cov, *MOTION.matrices(TRACKING.dt_s))
         z = [s[:, k] for s in seen]
         mean, cov, _ = update_joint(mean, cov, z, [s.matrix for s in sensors], [s.noise for s in sensors])
         yield mean
 
 
-def _fused(choice: RuleChoice, seen: list[Array], runs: int) -> Iterator[Array]:
+def _fused(choice: RuleChoice, seen: Sequence[Array], runs: int) -> Iterator[Array]:
     """One filter a sensor, fused after each step, the fused posterior fed back to all of them."""
-    rule, sensors = RULES[choice.key], list(TRACKING.sensors.values())
-    mean, cov = _start(runs)
+    rule, sensors = RULES[choice.key], list(SENSORS.values())
+    mean, cov = start(TRACKING, runs)
     for k in range(TRACKING.steps):
-        mean, cov = predict(mean, cov, *TRACKING.motion.matrices(TRACKING.dt_s))
+        mean, cov = predict(mean, cov, *MOTION.matrices(TRACKING.dt_s))
         local = [update(mean, cov, z[:, k], s.matrix, s.noise)[:2] for z, s in zip(seen, sensors, strict=True)]
         tracks = SourceTracks(np.stack([m for m, _ in local], 1), np.stack([c for _, c in local], 1))
         fused = rule.fuse(tracks, choice.params)
@@ -120,6 +122,9 @@ SCENARIO = Scenario(
         "the fused posterior is fed back to both filters at every step",
         "the truth starts exactly at the initial mean, the filters at the initial mean and covariance",
         "error: 2-norm, root-mean-square over runs at each step, averaged over the 100 steps",
+        "SIR: systematic resampling after every step; estimates before it; each filter draws again from the fused "
+        "density by itself (arithmetic average: from the union of the weighted particles, @gaussian: after conversion)",
+        "particles turned into a Gaussian: 1e-9 of the initial variances is added",
     ),
     study=study,
     tracking=TRACKING,
