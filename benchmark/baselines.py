@@ -43,3 +43,48 @@ def covariance_intersection_slsqp(means: Array, covs: Array) -> tuple[Array, Arr
 def lapack_floor(p1: Array, p2: Array) -> tuple[Array, Array, Array]:
     """One batched Cholesky, eigh and inverse of the arrays of a batch of pairs: what no kernel can do without."""
     return np.linalg.cholesky(p1 + p2), np.linalg.eigh(p1)[0], np.linalg.inv(p2)
+
+
+def association_costs_by_loop(row_mean: Array, row_cov: Array, col_mean: Array, col_cov: Array, gamma: float) -> Array:
+    """Fill the table of association costs pair by pair, with np.linalg.inv and np.linalg.det."""
+    cost = np.full((len(row_mean), len(col_mean)), 1e9)
+    for i in range(len(row_mean)):
+        for j in range(len(col_mean)):
+            s, r = row_cov[i] + col_cov[j], row_mean[i] - col_mean[j]
+            d2 = r @ np.linalg.inv(s) @ r
+            if d2 <= gamma:
+                cost[i, j] = d2 + np.log(np.linalg.det(s))
+    return cost
+
+
+def two_filters_and_intersection_looped(
+    mean0: Array, cov0: Array, f: Array, q: Array, h: Array, rs: list[Array], zs: list[Array], weight: float | None
+) -> Array:
+    """Run two Kalman filters with covariance intersection fed back, run by run, step by step.
+
+    zs: (R, T, m) a sensor. weight: of the first filter, or None: one bounded minimize_scalar of the trace a step.
+    """
+    runs, steps = zs[0].shape[:2]
+    found = np.empty((runs, steps, len(mean0)))
+    eye = np.eye(len(mean0))
+    for run in range(runs):
+        x, p = mean0, cov0
+        for k in range(steps):
+            x, p = f @ x, f @ p @ f.T + q
+            xs, infos = [], []
+            for r, z in zip(rs, zs, strict=True):
+                gain = p @ h.T @ np.linalg.inv(h @ p @ h.T + r)
+                xs.append(x + gain @ (z[run, k] - h @ x))
+                infos.append(np.linalg.inv((eye - gain @ h) @ p))
+            i1, i2 = infos
+            w = weight
+            if w is None:
+                w = minimize_scalar(_fused_trace, bounds=(0, 1), args=(i1, i2), method="bounded").x
+            p = np.linalg.inv(w * i1 + (1 - w) * i2)
+            x = p @ (w * i1 @ xs[0] + (1 - w) * i2 @ xs[1])
+            found[run, k] = x
+    return found
+
+
+def _fused_trace(w: float, i1: Array, i2: Array) -> float:
+    return float(np.trace(np.linalg.inv(w * i1 + (1 - w) * i2)))

@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 
 from track_fusion.chi_square import chi_square_quantile
 from track_fusion.linalg import Array
-from track_fusion.metrics.consistency import Consistency, consistency, nees
+from track_fusion.metrics.consistency import Consistency, consistency, consistency_of_sum, nees
 from track_fusion.params import Params, param
 from track_fusion.tracks import StateLayout, TrackBatch
 
@@ -48,8 +48,7 @@ class Evaluation:
         self._truth: dict[int, list[TrackBatch]] = defaultdict(list)
         self._tracks: dict[int, TrackBatch] = {}
         self._judged: dict[int, list[tuple[int, int, Array, float]]] = {}  # time -> (target, track, error, nees)
-        self._false = 0
-        self._missed = 0
+        self._nees_sum, self._samples_judged = 0.0, 0
 
     @property
     def times(self) -> int:
@@ -57,10 +56,11 @@ class Evaluation:
         return len(self._judged)
 
     def add_truth(self, truth: TrackBatch) -> None:
-        """Take the true state of a target."""
+        """Take the true state of a target; a repeated one replaces the one before."""
         if len(truth):
-            stamp_ns = int(truth.time_ns[0])
-            self._truth[stamp_ns].append(truth)
+            stamp_ns, again = int(truth.time_ns[0]), set(truth.track_id.tolist())
+            others = [b for b in self._truth[stamp_ns] if again.isdisjoint(b.track_id.tolist())]
+            self._truth[stamp_ns] = [*others, truth]
             self._judge(stamp_ns)
 
     def add_tracks(self, stamp_ns: int, tracks: TrackBatch) -> None:
@@ -81,18 +81,23 @@ class Evaluation:
         near = distance[target, track] < self._params.max_distance_m
         target, track = target[near], track[near]
         error = mean[track] - true_state[target]
+        turned = self._layout.angular
+        error[:, turned] = np.remainder(error[:, turned] + np.pi, 2 * np.pi) - np.pi
         values = nees(error, cov[track])
+        before = self._judged.get(stamp_ns, [])
         self._judged[stamp_ns] = [
             (int(truth.track_id[i]), int(tracks.track_id[j]), e, float(v))
             for i, j, e, v in zip(target, track, error, values, strict=True)
         ]
+        self._nees_sum += float(values.sum()) - sum(sample[-1] for sample in before)
+        self._samples_judged += len(values) - len(before)
 
     def _samples(self) -> list[tuple[int, int, int, Array, float]]:
         return [(t, *sample) for t, samples in sorted(self._judged.items()) for sample in samples]
 
     def consistency(self) -> Consistency:
-        """ANEES over all targets and times."""
-        return consistency(np.array([s[-1] for s in self._samples()]), self._layout.size)
+        """ANEES over all targets and times; kept up to date, since a node asks at every message."""
+        return consistency_of_sum(self._nees_sum, self._samples_judged, self._layout.size)
 
     def is_overconfident(self) -> bool:
         """Tell whether errors are larger than the covariances say, on enough samples and beyond doubt."""

@@ -8,17 +8,23 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.association.assignment import nearest_neighbour
+from track_fusion.association.assignment import assign, nearest_neighbour
+from track_fusion.association.gate import gate
 from track_fusion.chi_square import chi_square_quantile
 from track_fusion.filters.kalman import predict
-from track_fusion.linalg import Array
+from track_fusion.linalg import Array, is_positive_definite
 from track_fusion.models.motion import NearlyConstantVelocity
 from track_fusion.params import Params, param
 from track_fusion.rules import RULES, FusedTracks, Mixture, Rule, SourceTracks
 from track_fusion.track_manager import Bools, Changes, TrackManager, TrackManagerParams
-from track_fusion.tracks import TrackBatch
+from track_fusion.tracks import COASTED, CONFIRMED, TrackBatch
 
 SECOND_NS = 1_000_000_000
+#: A covariance is sound when it stays definite with this share of its variances taken away: some thousand times the
+#: rounding error of inverting it.
+RIDGE = 1e-12
+#: Added to variances that may be zero, as those of particles that coincide; SI units squared.
+LEAST_VARIANCE = 1e-24
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,141 +119,158 @@ class FusionCentre:
         TrackBatch    the tracks to publish, all at `time_ns`
         StepInfo
         """
+        for scan in scans.values():
+            self._check(scan, time_ns)
         fresh = np.zeros(self._sources, bool)
         fresh[list(scans)] = True
         self._newest.update({k: self._selected(scan) for k, scan in scans.items()})
         taking_part = {k: s for k, s in sorted(self._newest.items()) if self._is_young(s, time_ns)}
-        predicted = {k: predicted_to(s, time_ns, self._motion) for k, s in taking_part.items()}
-        central = predicted_to(self._manager.tracks, time_ns, self._motion)
-        pool = _Pool.of(taking_part, predicted, central[:0])
-        target, births = self._associate(central, predicted, fresh)
-        pool, target = pool.select(target >= 0), target[target >= 0]
-        fused, unconverged = self._fuse(central, pool, target, births, time_ns)
+        pool = _Pool.of(taking_part, self._manager.tracks, time_ns, self._motion)
+        target, births = self._associate(pool, fresh)
+        members = np.flatnonzero(target >= 0)
+        target, source = target[members], pool.source[members]
+        fused, unconverged = self._fuse(pool, members, target, births)
         member = np.zeros((len(fused), self._sources), bool)
-        member[target, pool.source] = True
+        member[target, source] = True
         supported = np.full(len(fused), -1, np.int64)
-        np.maximum.at(supported, target, pool.stamp_ns)
+        np.maximum.at(supported, target, pool.stamp_ns[members])
         changes = self._manager.commit(fused, member, fresh, supported)
-        everything = self._manager.tracks
-        published = everything if self.params.publish_tentative else everything[everything.is_confirmed]
-        members = np.bincount(pool.source, minlength=self._sources)
-        return published, StepInfo(members, changes, pool.shared_provenance(), unconverged)
+        published, confirmed = self._manager.tracks, self._manager.tracks.is_confirmed
+        if not (self.params.publish_tentative or confirmed.all()):
+            published = published[confirmed]
+        foreign = pool.tracks.source[members] & ~_bit(source)
+        taken = np.bincount(source, minlength=self._sources)
+        return published, StepInfo(taken, changes, int(np.count_nonzero(foreign)), unconverged)
+
+    def _check(self, scan: TrackBatch, time_ns: int) -> None:
+        """Refuse a scan before it changes anything."""
+        if (scan.layout, scan.frame_id, scan.phd) != (self.layout, self.frame_id, False):
+            kind = " as un-normalised mixtures (PHD)" if scan.phd else ""
+            raise ValueError(
+                f"A scan must hold {', '.join(self.layout.axes)} in '{self.frame_id}', its mixtures normalised. "
+                f"Got {', '.join(scan.layout.axes)} in '{scan.frame_id}'{kind}."
+            )
+        if len(scan) and scan.time_ns.max() > time_ns:
+            raise ValueError(f"A scan must not be later than the fusion time {time_ns} ns. Got {scan.time_ns.max()}.")
 
     def _selected(self, scan: TrackBatch) -> TrackBatch:
-        """Leave out source tracks that the parameters exclude."""
-        keep = np.ones(len(scan), bool)
-        if self.params.fuse_confirmed_only:
-            keep &= scan.is_confirmed
-        if not self.params.fuse_coasted:
-            keep &= ~scan.is_coasted
+        """Leave out source tracks that the parameters exclude, and identities: a central track's is its own."""
+        decisive = CONFIRMED * self.params.fuse_confirmed_only | COASTED * (not self.params.fuse_coasted)
+        keep = scan.status & decisive == CONFIRMED & decisive
+        scan = scan.replace(uuid=None)
         return scan if keep.all() else scan[keep]
 
     def _is_young(self, scan: TrackBatch, time_ns: int) -> bool:
         return len(scan) == 0 or time_ns - int(scan.time_ns.min()) <= self.params.max_scan_age_s * SECOND_NS
 
-    def _associate(
-        self, central: TrackBatch, predicted: Mapping[int, TrackBatch], fresh: Bools
-    ) -> tuple[NDArray[np.intp], int]:
-        """Say for each source track, sources in order, to which central track or newborn it belongs (-1: none)."""
-        position = self.layout.position
-        targets: list[NDArray[np.intp]] = []
-        newborn: list[TrackBatch] = []
-        births = 0
-        for k, scan in predicted.items():
-            target = nearest_neighbour(*scan.moments, *central.moments, self._gamma, position)
-            left = np.flatnonzero(target < 0) if fresh[k] else np.zeros(0, np.intp)
-            if len(left):
-                leftover = scan[left]
-                joined = np.full(len(left), -1, np.intp)
-                if newborn:
-                    groups = TrackBatch.concatenate(newborn)
-                    joined = nearest_neighbour(*leftover.moments, *groups.moments, self._gamma, position)
-                starts = joined < 0
-                joined[starts] = births + np.arange(starts.sum())
-                target[left] = len(central) + joined
-                if starts.any():
-                    newborn.append(leftover[starts])
-                    births += int(starts.sum())
-            targets.append(target)
-        return (np.concatenate(targets) if targets else np.zeros(0, np.intp)), births
+    def _associate(self, pool: _Pool, fresh: Bools) -> tuple[NDArray[np.intp], int]:
+        """Say for each source track to which central track or newborn it belongs (-1: none); count the newborn."""
+        mean, cov, central_mean, central_cov = pool.split()
+        count, gamma, position = len(central_mean), self._gamma, self.layout.position
+        found = gate(mean, cov, central_mean, central_cov, gamma, position)
+        # One to one within each source, all sources at once: to each its own copy of the central tracks.
+        own = dataclasses.replace(found, col=found.col + count * pool.source[found.row])
+        target = assign(own, len(mean), count * self._sources, gamma)
+        target[target >= 0] %= count
+        starters = np.zeros(0, np.intp)  # the track that started each group
+        leftover = np.flatnonzero((target < 0) & fresh[pool.source])
+        for k in np.unique(pool.source[leftover]):
+            left = leftover[pool.source[leftover] == k]
+            joined = nearest_neighbour(mean[left], cov[left], mean[starters], cov[starters], gamma, position)
+            starts = joined < 0
+            joined[starts] = len(starters) + np.arange(starts.sum())
+            target[left] = count + joined
+            starters = np.append(starters, left[starts])
+        return target, len(starters)
 
     def _fuse(
-        self, central: TrackBatch, pool: _Pool, target: NDArray[np.intp], births: int, time_ns: int
+        self, pool: _Pool, members: NDArray[np.intp], target: NDArray[np.intp], births: int
     ) -> tuple[TrackBatch, int]:
         """Fuse the members of each target; tracks without members keep their predicted state."""
-        order = np.argsort(target, kind="stable")  # the pool is in source order: members stay so
-        counts = np.bincount(target, minlength=len(central) + births)
-        first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+        order = members[np.argsort(target, kind="stable")]  # the pool is in source order: members stay so
+        old = len(pool.tracks) - len(pool.source)
+        counts = np.bincount(target, minlength=old + births)
+        first = np.cumsum(counts) - counts
         parts: list[tuple[NDArray[np.intp], TrackBatch]] = []
-        coasting = np.flatnonzero(counts[: len(central)] == 0)
+        coasting = np.flatnonzero(counts == 0)
         if len(coasting):
-            parts.append((coasting, central[coasting].replace(source=np.zeros(len(coasting), np.uint32))))
+            kept = pool.tracks[len(pool.source) + coasting]
+            parts.append((coasting, kept.replace(source=np.zeros(len(coasting), np.uint32))))
         unconverged = 0
-        for size in np.unique(counts[counts > 0]):
+        for size in sorted(set(counts.tolist()) - {0}):
             rows = np.flatnonzero(counts == size)
-            at = order[first[rows][:, None] + np.arange(size)]
-            batch, failed = self._apply(pool, at, time_ns)
+            batch, failed = self._apply(pool, order[first[rows][:, None] + np.arange(size)])
             parts.append((rows, batch))
             unconverged += failed
         if not parts:
-            return central, 0
+            return pool.tracks, 0
+        if len(parts) == 1:
+            return parts[0][1], unconverged
         joined = TrackBatch.concatenate([b for _, b in parts])
         return joined[np.argsort(np.concatenate([r for r, _ in parts]), kind="stable")], unconverged
 
-    def _apply(self, pool: _Pool, at: NDArray[np.intp], time_ns: int) -> tuple[TrackBatch, int]:
+    def _apply(self, pool: _Pool, at: NDArray[np.intp]) -> tuple[TrackBatch, int]:
         """Put members, (M, K) rows of the pool, through the rule; a single one is taken as it is."""
-        tracks = pool.tracks
-        size = at.shape[1]
-        bits = np.bitwise_or.reduce(np.uint32(1) << pool.source[at].astype(np.uint32), axis=1)
-        existence = tracks.existence[at].max(1)
-        if size == 1:
-            return tracks[at[:, 0]].replace(source=bits, existence=existence), 0
+        first = pool.tracks[at[:, 0]].replace(
+            source=np.bitwise_or.reduce(_bit(pool.source[at]), axis=1), existence=pool.tracks.existence[at].max(1)
+        )
+        if at.shape[1] == 1:
+            return first, 0
         fused = self.rule.fuse(pool.gather(at), self._rule_params)
-        unconverged = int((~np.asarray(fused.info.get("converged", True))).sum())
+        unconverged = int(np.count_nonzero(~np.asarray(fused.info.get("converged", True))))
         weight, mean, cov = _components(fused)
-        batch = tracks.replace(
-            weight=weight, mean=mean, cov=cov,
-            time_ns=np.full(len(at), time_ns), track_id=np.zeros(len(at), np.int64), source=bits,
-            status=np.zeros(len(at), np.uint8), existence=existence,
-            dof=np.full(len(at), np.inf) if fused.dof is None else fused.dof,
-        )  # fmt: skip
-        return batch, unconverged
+        dof = np.full(len(at), np.inf) if fused.dof is None else fused.dof
+        return first.replace(weight=weight, mean=mean, cov=cov, dof=dof), unconverged
 
 
 @dataclasses.dataclass(frozen=True)
 class _Pool:
-    """The predicted tracks of all sources, in source order, with their source (P,) and own stamp (P,)."""
+    """All tracks of a step, predicted to its time: those of the sources, in source order, then the central ones.
+
+    Attributes
+    ----------
+    tracks : TrackBatch    P source tracks, T central tracks
+    mean, cov              moments of each, (P + T, n) and (P + T, n, n), fit to be inverted
+    source, stamp_ns       source and own stamp of each source track, (P,)
+    """
 
     tracks: TrackBatch
+    mean: Array
+    cov: Array
     source: NDArray[np.intp]
     stamp_ns: NDArray[np.int64]
 
     @classmethod
-    def of(cls, scans: Mapping[int, TrackBatch], predicted: Mapping[int, TrackBatch], empty: TrackBatch) -> _Pool:
-        if not scans:
-            return cls(empty, np.zeros(0, np.intp), np.zeros(0, np.int64))
+    def of(
+        cls, scans: Mapping[int, TrackBatch], central: TrackBatch, time_ns: int, motion: NearlyConstantVelocity
+    ) -> _Pool:
+        batches = [*scans.values(), central]
+        tracks = TrackBatch.concatenate([predicted_to(b, time_ns, motion) for b in batches])
+        mean, cov = tracks.moments
+        sound = conditioned(cov)
+        if tracks.components == 1:
+            tracks = tracks.replace(cov=sound[:, None])
         source = np.repeat(np.fromiter(scans, np.intp), [len(s) for s in scans.values()])
-        stamp = np.concatenate([s.time_ns for s in scans.values()])
-        return cls(TrackBatch.concatenate(list(predicted.values())), source, stamp)
+        return cls(tracks, mean, sound, source, np.concatenate([b.time_ns for b in batches])[: len(source)])
 
-    def select(self, keep: Bools) -> _Pool:
-        if keep.all():
-            return self
-        return _Pool(self.tracks[keep], self.source[keep], self.stamp_ns[keep])
+    def split(self) -> tuple[Array, Array, Array, Array]:
+        """Moments of the source tracks, then of the central ones."""
+        count = len(self.source)
+        return self.mean[:count], self.cov[:count], self.mean[count:], self.cov[count:]
 
     def gather(self, at: NDArray[np.intp]) -> SourceTracks:
         """Stack members (M, K) for a rule."""
-        mean, cov = self.tracks.moments
         dof = self.tracks.dof[at]
         mixture = None
         if self.tracks.components > 1:
-            mixture = Mixture(self.tracks.weight[at], self.tracks.mean[at], self.tracks.cov[at])
-        return SourceTracks(mean[at], cov[at], None if np.isinf(dof).all() else dof, mixture)
+            weight = self.tracks.weight[at]
+            used = int(np.flatnonzero(weight.any((0, 1)))[-1]) + 1  # the rest pads, say for a central track
+            mixture = Mixture(weight[..., :used], self.tracks.mean[at, :used], self.tracks.cov[at, :used])
+        return SourceTracks(self.mean[at], self.cov[at], None if np.isinf(dof).all() else dof, mixture)
 
-    def shared_provenance(self) -> int:
-        """Count tracks whose provenance names a source other than their own."""
-        own = np.uint32(1) << self.source.astype(np.uint32)
-        return int(((self.tracks.source & ~own) > 0).sum())
+
+def _bit(source: NDArray[np.intp]) -> NDArray[np.uint32]:
+    return np.left_shift(np.uint32(1), source.astype(np.uint32))
 
 
 def _components(fused: FusedTracks) -> tuple[Array, Array, Array]:
@@ -255,6 +278,21 @@ def _components(fused: FusedTracks) -> tuple[Array, Array, Array]:
     if fused.mixture is not None:
         return fused.mixture.weight, fused.mixture.mean, fused.mixture.cov
     return np.ones((len(fused.mean), 1)), fused.mean[:, None], fused.cov[:, None]
+
+
+def conditioned(cov: Array) -> Array:
+    """Inflate the covariances that are singular to working precision, so that they can be inverted, (N, n, n).
+
+    A covariance sound in itself may turn so by prediction over a long time. Others are returned as they are.
+    """
+    ridge = RIDGE * np.eye(cov.shape[-1])
+    reduced = cov * (1.0 - ridge)
+    try:
+        np.linalg.cholesky(reduced)
+    except np.linalg.LinAlgError:
+        weak = ~is_positive_definite(reduced)[:, None, None]
+        return np.where(weak, cov * (1.0 + ridge) + LEAST_VARIANCE / RIDGE * ridge, cov)
+    return cov
 
 
 def predicted_to(batch: TrackBatch, time_ns: int, motion: NearlyConstantVelocity) -> TrackBatch:

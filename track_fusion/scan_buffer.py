@@ -105,7 +105,7 @@ class ScanBuffer:
         stamps = [s.waiting[0] for s in self._sources if s.waiting]
         if not stamps:
             return None
-        oldest, arrival, _ = min(stamps, key=lambda entry: entry[0])
+        oldest, arrival, _ = min(stamps, key=lambda entry: entry[:2])
         time_ns = max(oldest, self.fused_ns)
         overdue = now_ns - arrival >= self._params.fusion_timeout_s * SECOND_NS
         if not overdue and self._params.trigger == "all_sources" and not self._complete(time_ns, now_ns):

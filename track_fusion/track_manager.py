@@ -84,11 +84,13 @@ class TrackManager:
         ids = np.concatenate([self.tracks.track_id, np.arange(self._next_id, self._next_id + new)])
         self._next_id += new
         self._remember(member, fresh, new)
-        self._supported_ns = np.maximum(np.concatenate([self._supported_ns, np.full(new, -1)]), supported_ns)
+        before = np.concatenate([self._supported_ns, np.full(new, -1)])
+        self._supported_ns = np.where(supported_ns >= 0, supported_ns, before)
         was_confirmed = np.concatenate([self.tracks.is_confirmed, np.zeros(new, bool)])
-        confirmed = was_confirmed | self._confirm()
-        status = confirmed * np.uint8(CONFIRMED) + ~member.any(1) * np.uint8(COASTED)
-        dead = self._expired(fused.time_ns) & ~member.any(1)
+        confirmed = was_confirmed if was_confirmed.all() else was_confirmed | self._confirm()
+        coasted = np.asarray(~member.any(1))
+        status = confirmed * np.uint8(CONFIRMED) + coasted * np.uint8(COASTED)
+        dead = coasted & self._expired(fused.time_ns) if coasted.any() else coasted
         self.tracks = fused.replace(track_id=ids, status=status)
         changes = Changes(ids[old:], ids[confirmed & ~was_confirmed & ~dead], ids[dead])
         if dead.any():
@@ -96,13 +98,15 @@ class TrackManager:
         return changes
 
     def _remember(self, member: Bools, fresh: Bools, new: int) -> None:
-        blank = np.zeros((new, len(fresh)))
-        history = np.concatenate([self._history, blank.astype(np.uint32)])
-        updates = np.concatenate([self._updates, blank.astype(np.int64)])
-        hit = (member & fresh).astype(np.uint32)
-        self._history = np.where(fresh, (history << np.uint32(1)) | hit, history)
-        self._updates = updates + fresh
-        self._hit_ever = np.concatenate([self._hit_ever, blank.astype(bool)]) | (hit > 0)
+        if new:
+            self._history, self._updates, self._hit_ever = (
+                np.concatenate([old, np.zeros((new, len(fresh)), old.dtype)])
+                for old in (self._history, self._updates, self._hit_ever)
+            )
+        hit = member & fresh
+        self._history = np.where(fresh, (self._history << np.uint32(1)) | hit, self._history)
+        self._updates = self._updates + fresh
+        self._hit_ever = self._hit_ever | hit
 
     def _confirm(self) -> Bools:
         needed, last = self._params.confirmation_threshold

@@ -297,7 +297,7 @@ def run_centre(scans, rule):
             candidates += [(source, rows[i]["track_id"], older[j]["track_id"]) for i, j in d2]
             for i, j in pairs.items():
                 older[j]["members"][source] = rows[i]
-            left = [row for i, row in enumerate(rows) if i not in pairs]
+            left = [row for i, row in enumerate(rows) if i not in pairs and source in new]
             groups = central[len(older) :]
             pairs, _ = associate(left, groups, margins)
             for i, row in enumerate(left):

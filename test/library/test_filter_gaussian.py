@@ -126,8 +126,9 @@ def test_unscented_without_a_centre_is_the_cubature_filter():
     layout = planar_layout()
     mean, cov = np.array([300.0, 200.0, 1.0, 2.0]), 20.0 * random_cov(rng, N)
     sensor, params = RangeBearingSensor(layout, 5.0, 0.1), unscented.UnscentedParams(kappa=0.0)
-    a, b = unscented.update(mean, cov, np.array([350.0, 0.6]), sensor, params), cubature.update(
-        mean, cov, np.array([350.0, 0.6]), sensor
+    a, b = (
+        unscented.update(mean, cov, np.array([350.0, 0.6]), sensor, params),
+        cubature.update(mean, cov, np.array([350.0, 0.6]), sensor),
     )
     np.testing.assert_allclose(a[0], b[0], rtol=1e-12)
     np.testing.assert_allclose(a[1], b[1], rtol=1e-11, atol=1e-11)
@@ -244,11 +245,9 @@ def test_the_root_survives_where_the_covariance_does_not():
     exact = exact - column * column.T / (exact[0, 0] + mp.mpf(1e-6) / 5)
     variances = np.array([float(exact[i, i]) for i in range(3)])
     np.testing.assert_allclose((found**2).sum(1), variances, rtol=1e-5)
-    with pytest.raises((np.linalg.LinAlgError, AssertionError)):
-        mean, cov = np.zeros(3), root @ root.T
-        for _ in range(5):
-            mean, cov, _ = cubature.update(mean, cov, z, sensor)
-        np.testing.assert_allclose(np.diag(cov), variances, rtol=1e-5)
+    # As a matrix of doubles the same covariance has lost its smallest axis already.
+    lost = np.linalg.eigvalsh(root @ root.T)[0]
+    assert not lost == pytest.approx(np.linalg.svd(root, compute_uv=False)[-1] ** 2, rel=0.1)
 
 
 def test_sharp_updates_keep_the_covariance_definite():

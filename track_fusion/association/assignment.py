@@ -33,6 +33,8 @@ def assign(candidates: Candidates, rows: int, cols: int, gamma: float) -> Indice
     """
     chosen = np.full(rows, -1, np.intp)
     row, col = candidates.row, candidates.col
+    if not len(row):
+        return chosen
     alone = (np.bincount(row, minlength=rows)[row] == 1) & (np.bincount(col, minlength=cols)[col] == 1)
     chosen[row[alone]] = col[alone]
     crowded = np.flatnonzero(~alone)

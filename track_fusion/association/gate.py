@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ Indices = NDArray[np.intp]
 TRY_ALL = 4096
 #: Exact gating works on pieces of so many pairs, to bound memory.
 PIECE = 65536
+#: Rows that one search of the tree looks for; each may be near every column.
+SEARCH_ROWS = 512
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,15 +52,19 @@ def gate(
     Candidates, ordered by row, then column
     """
     if len(row_mean) * len(col_mean) <= TRY_ALL or not position:
-        grid = np.indices((len(row_mean), len(col_mean))).reshape(2, -1)
-        row, col = grid[0], grid[1]
-    else:
-        row, col = _near(row_mean, row_cov, col_mean, col_cov, gamma, list(position))
-    pieces = [
-        _exact(row_mean, row_cov, col_mean, col_cov, row[i : i + PIECE], col[i : i + PIECE], gamma)
-        for i in range(0, max(len(row), 1), PIECE)
-    ]
-    return pieces[0] if len(pieces) == 1 else Candidates(*(np.concatenate(c) for c in zip(*pieces, strict=True)))
+        row, col = np.divmod(np.arange(len(row_mean) * len(col_mean)), max(len(col_mean), 1))
+        pieces = [(row[i : i + PIECE], col[i : i + PIECE]) for i in range(0, max(len(row), 1), PIECE)]
+        return _joined([_exact(row_mean, row_cov, col_mean, col_cov, *piece, gamma) for piece in pieces])
+    near = _near(row_mean, row_cov, col_mean, col_cov, gamma, list(position))
+    found = _joined([_exact(row_mean, row_cov, col_mean, col_cov, *piece, gamma) for piece in near])
+    order = np.lexsort((found.col, found.row))
+    return Candidates(found.row[order], found.col[order], found.distance[order], found.logdet[order])
+
+
+def _joined(parts: list[Candidates]) -> Candidates:
+    if len(parts) == 1:
+        return parts[0]
+    return Candidates(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Candidates)))
 
 
 def _exact(
@@ -67,33 +74,34 @@ def _exact(
     lower = np.linalg.cholesky(row_cov[row] + col_cov[col])
     white = np.linalg.solve(lower, residual[..., None])[..., 0]
     distance = (white * white).sum(-1)
-    inside = distance <= gamma
+    inside = np.flatnonzero(distance <= gamma)
     volume = 2.0 * np.log(np.diagonal(lower[inside], axis1=-2, axis2=-1)).sum(-1)
     return Candidates(row[inside], col[inside], distance[inside], volume)
 
 
 def _near(
     row_mean: Array, row_cov: Array, col_mean: Array, col_cov: Array, gamma: float, position: list[int]
-) -> tuple[Indices, Indices]:
-    """Pairs whose positions are close enough for the gate, by KD-trees.
+) -> Iterator[tuple[Indices, Indices]]:
+    """Pairs whose positions are close enough for the gate, by KD-trees, in pieces.
 
     The gate implies |dp|^2 <= gamma (largest eigenvalue of S) <= gamma (r_i^2 + r_j^2), r^2 the traces of
     the position blocks. Tracks are binned by r in powers of two, so that a vague track widens the
-    search for its own bin only.
+    search for its own bin only. Only so many rows are searched at once that memory stays bounded however crowded
+    the scene is.
     """
-    rows = _bins(row_cov, position)
     cols = _bins(col_cov, position)
-    found: list[tuple[Indices, Indices]] = []
     trees = {k: cKDTree(col_mean[at][:, position]) for k, at in cols.items()}
-    for i, at in rows.items():
-        tree = cKDTree(row_mean[at][:, position])
-        for j, other in trees.items():
-            reach = np.sqrt(gamma * (4.0 ** (i + 1) + 4.0 ** (j + 1))) * (1.0 + 1e-9)
-            pairs = tree.sparse_distance_matrix(other, reach, output_type="ndarray")
-            found.append((at[pairs["i"]], cols[j][pairs["j"]]))
-    row, col = (np.concatenate(c) for c in zip(*found, strict=True))
-    order = np.lexsort((col, row))
-    return row[order], col[order]
+    yield np.zeros(0, np.intp), np.zeros(0, np.intp)
+    for i, of_bin in _bins(row_cov, position).items():
+        for start in range(0, len(of_bin), SEARCH_ROWS):
+            at = of_bin[start : start + SEARCH_ROWS]
+            tree = cKDTree(row_mean[at][:, position])
+            for j, other in trees.items():
+                reach = np.sqrt(gamma * (4.0 ** (i + 1) + 4.0 ** (j + 1))) * (1.0 + 1e-9)
+                pairs = tree.sparse_distance_matrix(other, reach, output_type="ndarray")
+                for k in range(0, len(pairs), PIECE):
+                    piece = pairs[k : k + PIECE]
+                    yield at[piece["i"]], cols[j][piece["j"]]
 
 
 def _bins(cov: Array, position: list[int]) -> dict[int, Indices]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -29,8 +30,8 @@ QUANTITIES = {"position_armse_m": "position ARMSE / m", "velocity_armse_mps": "v
 def demo(name: str, rules: str, seed: int, runs: int, out: Path) -> None:
     """Run a published scenario by real ROS 2 processes, with each rule, and set it beside the library and the paper.
 
-    Replay, one tracker a sensor, the fusion centre and the evaluator run as processes of their own, in lockstep, the fused
-    posterior fed back to the trackers. Writes a bag (mcap), figures.json and tracks.png.
+    Replay, one tracker a sensor, the fusion centre and the evaluator run as processes of their own, in lockstep,
+    the fused posterior fed back to the trackers. Writes a bag (mcap), figures.json and tracks.png.
 
     Example: track-fusion demo li2022-linear --rules naive,arithmetic_average
     """
@@ -72,25 +73,22 @@ def _tables(result: dict[str, Any], rules: tuple[str, ...], runs: int) -> list[T
     figures = {f["name"]: f for f in result["figures"]}
     tables = []
     for quantity, title in QUANTITIES.items():
-        table = Table(title=title)
-        for column in (
-            "filter and rule",
-            "this run, ROS",
-            "this run, library",
-            f"{runs} runs, library",
-            "published",
-            "verdict",
-        ):
-            table.add_column(column, justify="left" if column in ("row", "verdict") else "right")
-        for row in ("kf-alone", *(f"kf-{r}" for r in rules)):
-            many = figures[f"library/{row}@{runs}-runs/{quantity}"]
-            published = "" if many["published"] is None else f"{many['published']:.2f}"
+        table = Table(
+            title=f"{title} (ROS and library: the same one run)", box=box.SIMPLE, pad_edge=False, padding=(0, 1, 0, 0)
+        )
+        table.add_column("", no_wrap=True)
+        for column in ("ROS", "library", f"{runs} runs", "paper"):
+            table.add_column(column, justify="right", no_wrap=True)
+        table.add_column("verdict", min_width=12)
+        for row in ("alone", *rules):
+            name = f"kf-{row}"
+            many = figures[f"library/{name}@{runs}-runs/{quantity}"]
             table.add_row(
-                row,
-                f"{figures[f'ros/{row}/{quantity}']['value']:.6f}",
-                f"{figures[f'library/{row}/{quantity}']['value']:.6f}",
+                "sensor 1 alone" if row == "alone" else row,
+                f"{figures[f'ros/{name}/{quantity}']['value']:.4f}",
+                f"{figures[f'library/{name}/{quantity}']['value']:.4f}",
                 f"{many['value']:.2f} ± {many['standard_error']:.2f}",
-                published,
+                "" if many["published"] is None else f"{many['published']:.2f}",
                 many["verdict"],
             )
         tables.append(table)

@@ -59,7 +59,7 @@ def update(mean: Array, cov: Array, z: Array, matrix: Array, noise: Array) -> tu
     residual = z - matvec(matrix, mean)
     cross = matrix @ cov
     spread = symmetrise(cross @ transpose(matrix) + noise)
-    gain = transpose(np.linalg.solve(spread, cross))
+    gain = transpose(np.asarray(np.linalg.solve(spread, cross), np.float64))
     keep = np.eye(mean.shape[-1]) - gain @ matrix
     posterior = symmetrise(keep @ cov @ transpose(keep) + gain @ noise @ transpose(gain))
     nis = (residual * np.linalg.solve(spread, residual[..., None])[..., 0]).sum(-1)

@@ -53,10 +53,13 @@ def consistency(values: Array, axes: int) -> Consistency:
     more often than 1 - CONFIDENCE says when the samples are the steps of one run.
     """
     values = np.asarray(values, float).ravel()
-    count = len(values)
+    return consistency_of_sum(float(values.sum()), len(values), axes)
+
+
+def consistency_of_sum(total: float, count: int, axes: int) -> Consistency:
+    """`consistency` of `count` NEES values whose sum is known."""
     if not count:
         return Consistency(float("nan"), float("nan"), float("nan"), 0, axes)
-    tail = 0.5 * (1.0 - CONFIDENCE)
-    terms = count * axes
+    tail, terms = 0.5 * (1.0 - CONFIDENCE), count * axes
     low, high = (chi_square_quantile(p, terms) / terms for p in (tail, 1.0 - tail))
-    return Consistency(float(values.mean()) / axes, low, high, count, axes)
+    return Consistency(total / terms, low, high, count, axes)

@@ -46,8 +46,8 @@ def open_bag(path: str) -> Any:
         raise Fault(
             "Playing a bag needs the Python package rosbags: pip install rosbags. On a robot, use ros2 bag play."
         ) from None
-    reader = Reader(Path(path))
     try:
+        reader = Reader(Path(path))
         reader.open()
     except Exception as error:
         raise Fault(f"The 'bag' parameter must be a rosbag2 directory. Got {path!r}: {error}") from None
@@ -66,7 +66,8 @@ def message_class(name: str) -> Any:
         return getattr(importlib.import_module(f"{package}.msg"), kind)
     except (ImportError, AttributeError):
         raise Fault(
-            f"The bag holds {name}, whose package {package} is not installed here; leave its topic out by bag_topics."
+            f"The type {name} cannot be had: its package {package} is not installed here. Leave its topics out "
+            "(of a bag: by bag_topics)."
         ) from None
 
 

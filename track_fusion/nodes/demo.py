@@ -110,6 +110,7 @@ def _over_ros(demo: Demo, rule: str | None, progress: Progress) -> dict[str, flo
             while min(recorder.counts[t] for t in topics) < steps and time.monotonic() < deadline:
                 spin()
             recorder.close()
+    progress(f"ROS, {name}", 1.0)
     result = json.loads(judged.read_text())
     judged.unlink()
     if result["times"] != steps or result["missed"]:

@@ -171,6 +171,8 @@ class ManagedNode(LifecycleNode):
                 self.log.error(str(error))
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
+            if not rclpy.utilities.ok():  # a signal has come meanwhile
+                return TransitionCallbackReturn.FAILURE
             self.log.error(f"{error}\n{traceback.format_exc()}")
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
@@ -305,12 +307,12 @@ def run(make: Callable[[], ManagedNode]) -> int:
         pass
     except ParameterError as error:
         return _failed(str(error), 2)
-    except Fault as error:
-        return _failed(str(error), 1)
-    except Exception:
+    except Exception as error:
+        # When a signal comes while the node is being built, what it builds upon is gone; that is no fault.
         if rclpy.utilities.ok():
-            raise
-        # A signal came while the node was being built: what it built upon is gone.
+            if not isinstance(error, Fault):
+                raise
+            return _failed(str(error), 1)
     finally:
         _close(node)
     return 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ QUEUE = 1000
 
 class Recorder:
     """Writes every message of some topics, as serialised, with the node's time of its arrival.
+
+    What comes before simulated time has begun is written with the first time there is.
 
     Parameters
     ----------
@@ -45,22 +47,32 @@ class Recorder:
         if path.exists():
             raise Fault(f"{path} exists already; a bag is not overwritten.")
         self._node, self.counts = node, Counter[str]()
+        self._early: deque[tuple[Any, bytes]] = deque()
+        classes = {kind: message_class(kind) for kind in topics.values()}
         self._writer = Writer(path, version=9, storage_plugin=plugins[storage])
         self._writer.open()
         store = get_typestore(Stores.ROS2_JAZZY)
         for topic, kind in topics.items():
             connection = self._writer.add_connection(topic, kind, typestore=store)
-            node.create_subscription(message_class(kind), topic, self._write(connection), qos(QUEUE), raw=True)
+            node.create_subscription(classes[kind], topic, self._write(connection), qos(QUEUE), raw=True)
 
     def _write(self, connection: Any) -> Callable[[Any], None]:
         def write(data: Any) -> None:
-            self._writer.write(connection, self._node.get_clock().now().nanoseconds, bytes(data))
+            self._early.append((connection, bytes(data)))
             self.counts[connection.topic] += 1
+            if now_ns := self._node.get_clock().now().nanoseconds:
+                self._flush(now_ns)
 
         return write
 
+    def _flush(self, now_ns: int) -> None:
+        while self._early:
+            connection, data = self._early.popleft()
+            self._writer.write(connection, now_ns, data)
+
     def close(self) -> None:
         """Finish the bag."""
+        self._flush(self._node.get_clock().now().nanoseconds)
         self._writer.close()
 
 

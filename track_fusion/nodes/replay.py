@@ -204,7 +204,7 @@ class ReplayNode(ManagedNode):
 
     def close(self) -> None:
         """Let reliable readers take the last messages before the writer is gone."""
-        for pub in self._wanted if self.finished and rclpy.utilities.ok() else ():
+        for pub in (*self._wanted, self._clock_out) if self.finished and rclpy.utilities.ok() else ():
             pub.wait_for_all_acked(Duration(seconds=ACK_DEADLINE_S))
 
     def diagnose(self) -> tuple[list[str], dict[str, Any]]:

@@ -6,6 +6,7 @@ import math
 from typing import Any, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import InvalidParameterValueException
 from rclpy.node import Node
 
 from track_fusion.params import ParameterError, Params, Spec, from_dict, specs, unknown_name_error
@@ -33,7 +34,10 @@ def declare(node: Node, cls: type[P], prefix: str = "") -> P:
         full = prefix + name
         # ROS knows no empty list without a type: such a default stays unset.
         start = None if default == () else list(default) if isinstance(default, tuple) else default
-        given = node.declare_parameter(full, start, _descriptor(full, spec)).value
+        try:
+            given = node.declare_parameter(full, start, _descriptor(full, spec)).value
+        except InvalidParameterValueException:  # the range of the descriptor; the dataclass says more
+            given = node._parameter_overrides[full].value
         values[name] = default if given is None else given
     try:
         return from_dict(cls, values)

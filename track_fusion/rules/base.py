@@ -90,6 +90,7 @@ class Rule:
     order_matters: bool = False
     needs: tuple[str, ...] = ()  # names of `extras`
     affine_equivariant: bool | str = True  # a string says why not, or under which parameters
+    linear: bool = False  # the fused mean is linear in the means; all else depends on the covariances alone
 
     def __call__(self, tracks: SourceTracks, params: Params | None = None) -> FusedTracks:
         """Check the tracks, then fuse them; `fuse` alone trusts them, for callers that screened them before.

@@ -281,5 +281,6 @@ RULE = Rule(
     caveat="if every track is; for every cross-correlation",
     source="Li 2022 (16)-(18)",
     cost="K n^3, about ten times that for K > 2",
+    linear=True,
     affine_equivariant="not with criterion trace: the trace depends on the units of the axes",
 )

@@ -54,4 +54,5 @@ RULE = Rule(
     caveat="exact for independent errors only; K copies of one track claim P / K",
     source="Li 2022 (14)",
     cost="K n^3",
+    linear=True,
 )

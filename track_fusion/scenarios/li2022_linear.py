@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
 from track_fusion.filters.kalman import predict, update, update_joint
 from track_fusion.linalg import Array
-from track_fusion.metrics.accuracy import Estimate
+from track_fusion.metrics.accuracy import Estimate, armse
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
-from track_fusion.rules import RULES, SourceTracks
+from track_fusion.rules import RULES
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.naive import NaiveParams
-from track_fusion.scenarios.base import RuleChoice, Scenario, Tracking
-from track_fusion.scenarios.one_target import Quantity, Row, Sample, Sir, measured, sir_alone, sir_fused, start
+from track_fusion.scenarios.base import RuleChoice, Scenario, Tracking, fuse_runs
+from track_fusion.scenarios.one_target import Quantity, Row, Sir, sir_alone, sir_fused
+from track_fusion.scenarios.one_target import squared_errors as collect
 from track_fusion.tracks import planar_layout
 
 #: Table I: ARMSE of position (m) and velocity (m/s).
@@ -64,16 +64,33 @@ def study(runs: int, seed: int, progress: Callable[[float], None]) -> dict[str, 
     -------
     {figure name: Estimate}, names like kf-alone/position_armse_m
     """
-    return measured(TRACKING, rows(), QUANTITIES, runs, seed, progress)
+    errors = squared_errors(range(runs), seed, progress, kalman_rows() | particle_rows())
+    return {name: armse(squares) for name, squares in errors.items()}
 
 
-def rows() -> dict[str, Row]:
-    """Every row of Table I."""
-    table = {"kf-alone": Row(lambda s: _one_filter(s.seen[:1], len(s.runs)))}
-    table["kf-ic"] = Row(lambda s: _one_filter(s.seen, len(s.runs)))
+def squared_errors(
+    runs: Sequence[int], seed: int, progress: Callable[[float], None], rows: Mapping[str, Row] | None = None
+) -> dict[str, Array]:
+    """Run rows of Table I, by default the Kalman filters', over these Monte Carlo runs.
+
+    Returns
+    -------
+    {figure name: squared norm of the error (R, T)}
+    """
+    return collect(TRACKING, kalman_rows() if rows is None else rows, QUANTITIES, runs, seed, progress)
+
+
+def kalman_rows() -> dict[str, Row]:
+    """Rows of Table I by Kalman filters."""
+    table = {"kf-alone": Row(lambda s: one_filter(s.seen[:1])), "kf-ic": Row(lambda s: one_filter(s.seen))}
     for choice in RULE_CHOICES:
-        table[f"kf-{choice.name}"] = Row(partial(_fused_of, choice))
-    table |= {"sir-alone": sir_alone(TRACKING, SIR, 1), "sir-ic": sir_alone(TRACKING, SIR, 2)}
+        table[f"kf-{choice.name}"] = Row(lambda s, choice=choice: fused_filters(choice, s.seen))  # type: ignore[misc]
+    return table
+
+
+def particle_rows() -> dict[str, Row]:
+    """Rows of Table I by particle filters."""
+    table = {"sir-alone": sir_alone(TRACKING, SIR, 1), "sir-ic": sir_alone(TRACKING, SIR, 2)}
     for choice in RULE_CHOICES:
         averaged = choice.key == "arithmetic_average"
         table[f"sir-{choice.name}"] = sir_fused(TRACKING, SIR, choice, union=averaged)
@@ -82,14 +99,15 @@ def rows() -> dict[str, Row]:
     return table
 
 
-def _fused_of(choice: RuleChoice, sample: Sample) -> Iterator[Array]:
-    return _fused(choice, sample.seen, len(sample.runs))
+def _start(runs: int) -> tuple[Array, Array]:
+    """State of all runs, (R, n), and its covariance, (1, n, n), which they share as long as it depends on no data."""
+    return np.tile(TRACKING.initial_mean, (runs, 1)), TRACKING.initial_cov[None]
 
 
-def _one_filter(seen: Sequence[Array], runs: int) -> Iterator[Array]:
-    """One filter that uses the measurements of the given sensors jointly."""
+def one_filter(seen: Sequence[Array]) -> Iterator[Array]:
+    """One filter that uses the measurements of the given sensors, (R, T, m) each, jointly."""
     sensors = list(SENSORS.values())[: len(seen)]
-    mean, cov = start(TRACKING, runs)
+    mean, cov = _start(len(seen[0]))
     for k in range(TRACKING.steps):
         mean, cov = predict(mean, cov, *MOTION.matrices(TRACKING.dt_s))
         z = [s[:, k] for s in seen]
@@ -97,16 +115,15 @@ def _one_filter(seen: Sequence[Array], runs: int) -> Iterator[Array]:
         yield mean
 
 
-def _fused(choice: RuleChoice, seen: Sequence[Array], runs: int) -> Iterator[Array]:
+def fused_filters(choice: RuleChoice, seen: Sequence[Array]) -> Iterator[Array]:
     """One filter a sensor, fused after each step, the fused posterior fed back to all of them."""
     rule, sensors = RULES[choice.key], list(SENSORS.values())
-    mean, cov = start(TRACKING, runs)
+    mean, cov = _start(len(seen[0]))
     for k in range(TRACKING.steps):
         mean, cov = predict(mean, cov, *MOTION.matrices(TRACKING.dt_s))
         local = [update(mean, cov, z[:, k], s.matrix, s.noise)[:2] for z, s in zip(seen, sensors, strict=True)]
-        tracks = SourceTracks(np.stack([m for m, _ in local], 1), np.stack([c for _, c in local], 1))
-        fused = rule.fuse(tracks, choice.params)
-        mean, cov = fused.mean, fused.cov
+        means, covs = (np.stack(parts, 1) for parts in zip(*local, strict=True))
+        mean, cov = fuse_runs(rule, choice.params, means, covs)
         yield mean
 
 

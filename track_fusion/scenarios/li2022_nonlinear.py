@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from track_fusion.filters import cubature
-from track_fusion.metrics.accuracy import Estimate
+from track_fusion.metrics.accuracy import Estimate, armse
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
@@ -21,9 +21,9 @@ from track_fusion.scenarios.one_target import (
     Sir,
     gaussian_alone,
     gaussian_fused,
-    measured,
     sir_alone,
     sir_fused,
+    squared_errors,
 )
 from track_fusion.tracks import StateLayout
 
@@ -90,7 +90,8 @@ def study(runs: int, seed: int, progress: Callable[[float], None]) -> dict[str, 
     -------
     {figure name: Estimate}, names like ckf-alone/position_armse_m
     """
-    return measured(TRACKING, rows(), QUANTITIES, runs, seed, progress)
+    errors = squared_errors(TRACKING, rows(), QUANTITIES, range(runs), seed, progress)
+    return {name: armse(squares) for name, squares in errors.items()}
 
 
 SCENARIO = Scenario(

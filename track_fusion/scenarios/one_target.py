@@ -1,7 +1,7 @@
 """One target seen by sensors with a filter each, whose posteriors are fused and fed back: what Li 2022 studies.
 
 Every row of a table is an iterator of estimates over the steps, batched over Monte Carlo runs; errors are
-collected by :func:`measured`.
+collected by :func:`squared_errors`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from track_fusion.filters import iterated_corrector, particle
 from track_fusion.filters.iterated_corrector import GaussianUpdate
 from track_fusion.filters.particle import Particles
 from track_fusion.linalg import Array
-from track_fusion.metrics.accuracy import Estimate, armse
 from track_fusion.models.base import Transition
 from track_fusion.random_streams import stream
 from track_fusion.rules import RULES, FusedTracks, SourceTracks
@@ -40,7 +39,7 @@ class Sample(NamedTuple):
     """Monte Carlo runs: which, and what each sensor saw in them, (R, T, m) each."""
 
     seed: int
-    runs: range
+    runs: Sequence[int]
     seen: Sequence[Array]
 
 
@@ -165,38 +164,38 @@ def _drawn_again(
     return particle.RESAMPLING[sir.resampling](particle.union(clouds, fused.weights), rng, sir.count)
 
 
-def drawn(tracking: Tracking, runs: int, seed: int) -> tuple[Array, Sample]:
-    """Draw the truth (R, T + 1, n) and the measurements of `runs` Monte Carlo runs."""
-    truth = np.stack([tracking.truth(seed, run) for run in range(runs)])
-    seen = [tracking.measurements(truth[run], seed, run) for run in range(runs)]
-    return truth, Sample(seed, range(runs), [np.stack([s[name] for s in seen]) for name in tracking.sensors])
+def drawn(tracking: Tracking, runs: Sequence[int], seed: int) -> tuple[Array, Sample]:
+    """Draw the truth (R, T + 1, n) and the measurements of these Monte Carlo runs."""
+    truth = tracking.truths(seed, runs)
+    seen = [tracking.measurements(states, seed, run) for states, run in zip(truth, runs, strict=True)]
+    return truth, Sample(seed, runs, [np.stack([s[name] for s in seen]) for name in tracking.sensors])
 
 
-def measured(
+def squared_errors(
     tracking: Tracking,
     rows: Mapping[str, Row],
     quantities: Mapping[str, Quantity],
-    runs: int,
+    runs: Sequence[int],
     seed: int,
     progress: Callable[[float], None],
-) -> dict[str, Estimate]:
-    """Run every row over the same `runs` Monte Carlo runs.
+) -> dict[str, Array]:
+    """Run every row over the same Monte Carlo runs.
 
     Returns
     -------
-    {row/quantity: Estimate} of the root-mean-square error, averaged over the steps
+    {row/quantity: squared norm of the error (R, T)}
     """
     truth, sample = drawn(tracking, runs, seed)
-    found: dict[str, Estimate] = {}
+    found: dict[str, Array] = {}
     for done, (name, row) in enumerate(rows.items()):
-        squares = np.empty((len(quantities), runs, tracking.steps))
-        for begin in range(0, runs, row.chunk or runs):
-            part = slice(begin, begin + (row.chunk or runs))
-            chosen = Sample(seed, sample.runs[part], [z[part] for z in sample.seen])
-            for k, mean in enumerate(row.estimates(chosen)):
+        names, step = [f"{name}/{q}" for q in quantities], row.chunk or len(runs)
+        found |= {full: np.empty((len(runs), tracking.steps)) for full in names}
+        for begin in range(0, len(runs), step):
+            part = slice(begin, min(begin + step, len(runs)))
+            for k, mean in enumerate(row.estimates(Sample(seed, runs[part], [z[part] for z in sample.seen]))):
                 error = mean - truth[part, k + 1]
-                for square, quantity in zip(squares, quantities.values(), strict=True):
-                    square[part, k] = ((error[:, quantity.axes] * quantity.factor) ** 2).sum(1)
-            progress((done + min(part.stop, runs) / runs) / len(rows))
-        found |= {f"{name}/{q}": armse(s) for q, s in zip(quantities, squares, strict=True)}
+                for full, quantity in zip(names, quantities.values(), strict=True):
+                    found[full][part, k] = ((error[:, quantity.axes] * quantity.factor) ** 2).sum(1)
+                share = (begin + (part.stop - begin) * (k + 1) / tracking.steps) / len(runs)
+                progress((done + share) / len(rows))
     return found
