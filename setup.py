@@ -32,6 +32,7 @@ TEST = [
     "pytest>=7.4",
     "hypothesis>=6.90",
     "mpmath>=1.2",
+    "pyriemann>=0.9,<0.12",  # 0.12 asks for NumPy 1.25 but needs 2
     "pyyaml>=6",
     *SCENARIOS,
     "cyclonedds>=0.10.5; platform_machine == 'x86_64'",

@@ -45,6 +45,30 @@ def lapack_floor(p1: Array, p2: Array) -> tuple[Array, Array, Array]:
     return np.linalg.cholesky(p1 + p2), np.linalg.eigh(p1)[0], np.linalg.inv(p2)
 
 
+def karcher_pyriemann(groups: Array) -> list[Array]:
+    """Riemannian mean of each group of covariances, (B, K, n, n): a loop over pyriemann, its defaults."""
+    from pyriemann.utils.mean import mean_riemann
+
+    return [mean_riemann(covs) for covs in groups]
+
+
+def log_euclidean_pyriemann(groups: Array) -> list[Array]:
+    """Log-Euclidean mean of each group of covariances, (B, K, n, n): a loop over pyriemann."""
+    from pyriemann.utils.mean import mean_logeuclid
+
+    return [mean_logeuclid(covs) for covs in groups]
+
+
+def mhdp_mean_minimize(means: Array, covs: Array, pull: float) -> Array:
+    """Mean of MHDP, squared criterion: one scipy.optimize.minimize over a function with np.linalg.inv."""
+    infos = [np.linalg.inv(p) for p in covs]
+
+    def cost(x: Array) -> float:
+        return float(sum(np.arccosh(1 + pull * (x - m) @ i @ (x - m)) ** 2 for m, i in zip(means, infos, strict=True)))
+
+    return minimize(cost, means.mean(0)).x
+
+
 def association_costs_by_loop(row_mean: Array, row_cov: Array, col_mean: Array, col_cov: Array, gamma: float) -> Array:
     """Fill the table of association costs pair by pair, with np.linalg.inv and np.linalg.det."""
     cost = np.full((len(row_mean), len(col_mean)), 1e9)

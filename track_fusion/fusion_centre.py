@@ -14,7 +14,7 @@ from track_fusion.chi_square import chi_square_quantile
 from track_fusion.filters.kalman import predict
 from track_fusion.linalg import Array, is_positive_definite
 from track_fusion.models.motion import NearlyConstantVelocity
-from track_fusion.params import Params, param
+from track_fusion.params import ParameterError, Params, param
 from track_fusion.rules import RULES, FusedTracks, Mixture, Rule, SourceTracks
 from track_fusion.track_manager import Bools, Changes, TrackManager, TrackManagerParams
 from track_fusion.tracks import COASTED, CONFIRMED, TrackBatch
@@ -76,6 +76,10 @@ class FusionCentre:
     params : FusionCentreParams
     rule_params : Params               of the rule `params.state_fusion`; None = its defaults
     manager_params : TrackManagerParams
+
+    Raises
+    ------
+    ParameterError    the rule needs what source tracks do not bring, such as their cross-covariance
     """
 
     def __init__(
@@ -91,6 +95,11 @@ class FusionCentre:
         self.layout, self.frame_id, self._motion = motion.layout, frame_id, motion
         self.rule: Rule = RULES[params.state_fusion]
         self._rule_params = self.rule.params() if rule_params is None else rule_params
+        if needed := self.rule.needed(self._rule_params):
+            raise ParameterError(
+                f"The 'state_fusion' parameter must be a rule that needs only tracks. Got '{self.rule.key}', "
+                f"which at these parameters needs {', '.join(needed)}: use it in the library or by track-fusion fuse."
+            )
         self._manager_params = manager_params or TrackManagerParams()
         self._gamma = chi_square_quantile(params.gate_probability, self.layout.size)
         self._sources = sources
@@ -135,9 +144,9 @@ class FusionCentre:
         supported = np.full(len(fused), -1, np.int64)
         np.maximum.at(supported, target, pool.stamp_ns[members])
         changes = self._manager.commit(fused, member, fresh, supported)
-        published, confirmed = self._manager.tracks, self._manager.tracks.is_confirmed
-        if not (self.params.publish_tentative or confirmed.all()):
-            published = published[confirmed]
+        published = self._manager.tracks
+        if not (self.params.publish_tentative or published.is_confirmed.all()):
+            published = published[published.is_confirmed]
         foreign = pool.tracks.source[members] & ~_bit(source)
         taken = np.bincount(source, minlength=self._sources)
         return published, StepInfo(taken, changes, int(np.count_nonzero(foreign)), unconverged)
@@ -302,10 +311,13 @@ def predicted_to(batch: TrackBatch, time_ns: int, motion: NearlyConstantVelocity
     ------
     ValueError    a track is later than `time_ns`
     """
-    if not len(batch) or (batch.time_ns == time_ns).all():
+    if not len(batch):
         return batch
-    if (batch.time_ns == batch.time_ns[0]).all():
-        transition, noise = motion.matrices((time_ns - int(batch.time_ns[0])) / SECOND_NS)
+    first = int(batch.time_ns[0])
+    if (batch.time_ns == first).all():
+        if first == time_ns:
+            return batch
+        transition, noise = motion.matrices((time_ns - first) / SECOND_NS)
     else:
         steps = motion.batch((time_ns - batch.time_ns) / SECOND_NS)
         transition, noise = steps[0][:, None], steps[1][:, None]

@@ -41,6 +41,21 @@ def inverse(cov: Array) -> Array:
     return symmetrise(np.asarray(np.linalg.inv(cov), np.float64))
 
 
+def cholesky(cov: Array) -> Array:
+    """Lower triangular factors of positive definite matrices, (..., n, n).
+
+    Raises
+    ------
+    LinAlgError    a matrix is not positive definite
+    """
+    return np.asarray(np.linalg.cholesky(cov), np.float64)
+
+
+def whitener(cov: Array) -> Array:
+    """W, lower triangular, with W P W' = 1 for positive definite matrices P, (..., n, n)."""
+    return np.asarray(np.linalg.inv(cholesky(cov)), np.float64)
+
+
 def solve(a: Array, b: Array) -> Array:
     """Return A^-1 B, (..., n, n), (..., n, k) -> (..., n, k).
 
@@ -51,20 +66,36 @@ def solve(a: Array, b: Array) -> Array:
     return np.asarray(np.linalg.solve(a, b), np.float64)
 
 
-def cholesky(cov: Array) -> Array:
-    """Lower triangular root of positive definite matrices, (..., n, n).
-
-    Raises
-    ------
-    LinAlgError    a matrix is not positive definite
-    """
-    return np.asarray(np.linalg.cholesky(cov), np.float64)
-
-
 def logdet(cov: Array) -> Array:
     """Log-determinant of positive definite matrices, (..., n, n) -> (...)."""
     diagonal = np.diagonal(np.linalg.cholesky(cov), axis1=-2, axis2=-1)
     return np.asarray(2.0 * np.log(diagonal).sum(-1))
+
+
+#: A pivot of a matrix scaled to order one that is smaller counts as zero.
+SMALLEST_PIVOT = 1e-9
+
+
+def eliminate(a: Array, b: Array) -> tuple[NDArray[np.bool_], Array, Array]:
+    """Tell which a (..., n, n) are positive definite; log-determinant and b' a^-1 b of those.
+
+    Gaussian elimination over the whole stack: unlike Cholesky it does not stop at a matrix that is indefinite.
+    """
+    n = a.shape[-1]
+    a, b = np.array(np.moveaxis(a, (-2, -1), (0, 1)), order="C"), np.array(np.moveaxis(b, -1, 0), order="C")
+    positive = np.ones(a.shape[2:], bool)
+    logdet, square = np.zeros(a.shape[2:]), np.zeros(a.shape[2:])
+    for k in range(n):
+        good = a[k, k] > SMALLEST_PIVOT
+        positive &= good
+        pivot = np.where(good, a[k, k], 1.0)
+        logdet += np.log(pivot)
+        square += b[k] * b[k] / pivot
+        for i in range(k + 1, n):
+            ratio = a[i, k] / pivot
+            a[i, k + 1 :] -= ratio * a[k, k + 1 :]
+            b[i] -= ratio * b[k]
+    return positive, logdet, square
 
 
 def mahalanobis_squared(residual: Array, cov: Array) -> Array:

@@ -106,19 +106,24 @@ def minimise_one(derivatives: ScalarDerivatives) -> tuple[float, bool, int]:
 GAP = 1e-12
 #: Weights this small whose multiplier says that they vanish are set to zero.
 VANISHING = 1e-7
+#: What is left of a vanishing multiplier, relative to the gradient: rounding of the Hessian.
+FLOOR = 1e-14
 MAX_INTERIOR = 60
 
 #: w (b, K), rows (b,) -> gradient (b, K) and Hessian (b, K, K) of a convex function.
 GradientHessian = Callable[[Array, NDArray[np.intp]], tuple[Array, Array]]
 
 
-def minimise_on_simplex(gradient_hessian: GradientHessian, count: int, sources: int) -> Solution:
+def minimise_on_simplex(
+    gradient_hessian: GradientHessian, count: int, sources: int, start: Array | None = None
+) -> Solution:
     """Minimise `count` convex functions on the simplex of `sources` weights by a primal-dual interior point.
 
     Parameters
     ----------
     gradient_hessian : callable    (w (b, K), rows (b,)) -> (b, K), (b, K, K)
     count, sources : int           number of functions and of weights K
+    start : (count, K) or None     positive weights of sum 1 to start from; None = equal ones
 
     Returns
     -------
@@ -128,7 +133,7 @@ def minimise_on_simplex(gradient_hessian: GradientHessian, count: int, sources: 
                   objective of a convex f exceeds its minimum by at most g'w - min g, g its gradient; that is
                   the test of convergence, or a step too short to matter where rounding hides the gap.
     """
-    weights = np.full((count, sources), 1.0 / sources)
+    weights = np.full((count, sources), 1.0 / sources) if start is None else start.copy()
     converged = np.zeros(count, bool)
     iterations = np.zeros(count, np.intp)
     rows = np.arange(count)
@@ -166,7 +171,8 @@ def _interior_step(
     kkt = np.ones((len(w), sources + 1, sources + 1))
     kkt[:, :sources, :sources] = hessian
     diagonal = np.arange(sources)
-    kkt[:, diagonal, diagonal] += z / w
+    # The floor keeps a row solvable whose tracks are all equal: no multiplier, and any weights do.
+    kkt[:, diagonal, diagonal] += np.maximum(z / w, FLOOR * scale[:, None])
     kkt[:, sources, sources] = 0.0
     right = np.zeros((len(w), sources + 1))
     right[:, :sources] = centre - gradient

@@ -128,7 +128,7 @@ class ScanBuffer:
     def _complete(self, time_ns: int, now_ns: int) -> bool:
         silence = self._params.source_timeout_s * SECOND_NS
         live = [s for s in self._sources if now_ns - s.heard_ns < silence]
-        return all(s.newest_ns > time_ns or (s.newest_ns == time_ns and not s.assembles) for s in live)
+        return all(s.newest_ns >= time_ns for s in live)
 
     def silent_since(self, source: int, now_ns: int) -> float:
         """Seconds since the source was last heard (or since the first scan of any); negative: nothing yet."""

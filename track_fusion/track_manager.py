@@ -81,12 +81,13 @@ class TrackManager:
         Changes
         """
         old, new = len(self.tracks), len(fused) - len(self.tracks)
-        ids = np.concatenate([self.tracks.track_id, np.arange(self._next_id, self._next_id + new)])
-        self._next_id += new
-        self._remember(member, fresh, new)
-        before = np.concatenate([self._supported_ns, np.full(new, -1)])
-        self._supported_ns = np.where(supported_ns >= 0, supported_ns, before)
-        was_confirmed = np.concatenate([self.tracks.is_confirmed, np.zeros(new, bool)])
+        ids, was_confirmed = self.tracks.track_id, self.tracks.is_confirmed
+        if new:
+            ids = np.append(ids, np.arange(self._next_id, self._next_id + new))
+            was_confirmed = np.append(was_confirmed, np.zeros(new, bool))
+            self._enrol(new)
+        self._remember(member, fresh)
+        self._supported_ns = np.where(supported_ns >= 0, supported_ns, self._supported_ns)
         confirmed = was_confirmed if was_confirmed.all() else was_confirmed | self._confirm()
         coasted = np.asarray(~member.any(1))
         status = confirmed * np.uint8(CONFIRMED) + coasted * np.uint8(COASTED)
@@ -97,12 +98,14 @@ class TrackManager:
             self._keep(~dead)
         return changes
 
-    def _remember(self, member: Bools, fresh: Bools, new: int) -> None:
-        if new:
-            self._history, self._updates, self._hit_ever = (
-                np.concatenate([old, np.zeros((new, len(fresh)), old.dtype)])
-                for old in (self._history, self._updates, self._hit_ever)
-            )
+    def _enrol(self, new: int) -> None:
+        self._next_id += new
+        self._history, self._updates, self._hit_ever, self._supported_ns = (
+            np.concatenate([old, np.zeros((new, *old.shape[1:]), old.dtype)])
+            for old in (self._history, self._updates, self._hit_ever, self._supported_ns)
+        )
+
+    def _remember(self, member: Bools, fresh: Bools) -> None:
         hit = member & fresh
         self._history = np.where(fresh, (self._history << np.uint32(1)) | hit, self._history)
         self._updates = self._updates + fresh

@@ -208,9 +208,10 @@ class TrackBatch:
 
     def replace(self, **fields: Any) -> TrackBatch:
         """Return a batch with some arrays exchanged for computed ones of the same N; not checked again."""
-        kept = vars(self) | fields
-        kept.pop("moments", None)  # cached, of the arrays before
-        return self._trusted(**kept)
+        batch = object.__new__(TrackBatch)
+        vars(batch).update(vars(self) | fields)
+        vars(batch).pop("moments", None)  # cached, of the arrays before
+        return batch
 
     def __getitem__(self, index: Any) -> TrackBatch:
         """Select tracks by a mask, an index array or a slice."""

@@ -117,6 +117,19 @@ def test_the_covariance_is_the_covariance_whatever_the_dof() -> None:
     assert fused([{**FIRST, "dof": 5}, {**SECOND, "dof": None}]) == fused(PAIR)
 
 
+def test_tracks_of_a_family_are_fused_as_such_and_say_their_dof() -> None:
+    """The static example of Chen 2022: scatters 5 and 7 of Student-t tracks; then a shape that a parameter says."""
+    tracks = [{"mean": [2.0], "cov": [[15.0]], "dof": 3}, {"mean": [4.0], "cov": [[21.0]], "dof": 3}]
+    answer = fused(tracks, "mhdp_explicit")
+    assert answer["dof"] == 3.0
+    assert answer["info"]["converged"] is True
+    unsquared = fused(tracks, "mhdp_iterative", {"criterion": "unsquared"})
+    assert (unsquared["mean"], unsquared["info"]["snapped"]) == ([2.0], 0)
+    shaped = fused(tracks, "mhdp_explicit", {"family": "generalized_gaussian", "beta": 0.65})
+    assert shaped["dof"] is None
+    assert shaped["mean"] != answer["mean"]
+
+
 def test_every_rule_takes_two_plain_tracks_or_says_what_it_needs() -> None:
     for rule in RULES.values():
         if rule.needs:

@@ -113,6 +113,12 @@ def test_assignment_is_the_cheapest_of_all(seed):
     assert cost_of(assign(found, rows, cols, GAMMA).tolist(), found) == pytest.approx(best, abs=1e-9)
 
 
+def test_a_miss_costs_the_gate_and_the_largest_determinant_of_its_component():
+    """Row 0 alone with column 0 and row 1 missed would cost .1 + gamma + 8, against 5 + 13 for both rows."""
+    found = Candidates(np.array([0, 0, 1]), np.array([0, 1, 0]), np.array([0.1, 5.0, 5.0]), np.array([0.0, 0.0, 8.0]))
+    np.testing.assert_array_equal(assign(found, 2, 2, GAMMA), [1, 0])
+
+
 def test_a_miss_is_cheaper_than_a_pair_that_makes_another_miss_its_own():
     """Rows 0 and 1 want column 0; the vague row 0 has the larger determinant, and is left out."""
     found = Candidates(np.array([0, 1]), np.array([0, 0]), np.array([0.1, 3.0]), np.array([8.0, 0.0]))

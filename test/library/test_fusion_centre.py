@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from track_fusion.filters.kalman import predict, update
 from track_fusion.fusion_centre import FusionCentre, FusionCentreParams
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
+from track_fusion.params import ParameterError
 from track_fusion.rules import RULES
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.track_manager import TrackManagerParams
@@ -177,7 +178,7 @@ def test_identity_survives_the_loss_of_the_source_that_gave_birth():
 # ---- what each step promises ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", [key for key, rule in RULES.items() if not rule.needed(rule.params())])
 def test_a_single_member_is_taken_as_it_is(rule):
     batch = tracks([[1, 2]], 0, existence=0.7, dof=5.0)
     fused, _ = centre(rule=rule).step(0, {1: batch})
@@ -448,3 +449,9 @@ def test_conservative_rules_stay_below_the_nees_bound_that_naive_fusion_exceeds(
     """FIELD pain 10: double counting of the common process noise."""
     anees, bound = run_two_trackers(rule, params)
     assert bool(anees < bound) is consistent, (anees, bound)
+
+
+@pytest.mark.parametrize("key", [key for key, rule in RULES.items() if rule.needed(rule.params())])
+def test_a_rule_that_needs_more_than_tracks_is_refused_at_the_start(key: str) -> None:
+    with pytest.raises(ParameterError, match=f"must be a rule that needs only tracks. Got '{key}'"):
+        centre(rule=key)

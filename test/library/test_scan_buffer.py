@@ -190,6 +190,14 @@ def test_pieces_wait_no_longer_than_the_timeout_and_come_too_late_after_it(trigg
     assert add(buf, 0, 100, 151, 9) == "late_scan"
 
 
+def test_pieces_that_were_fused_are_not_waited_for_again():
+    buf = buffer(assembles=(1,), fusion_timeout_s=0.05)
+    add(buf, 1, 100, 100, 5)
+    assert times(buf, 150) == [100]
+    add(buf, 0, 100, 151)
+    assert steps(buf, 151) == [(100, {0: [100]})]
+
+
 def test_the_step_of_a_whole_scan_waits_for_the_pieces_of_another_source():
     buf = buffer(2, assembles=(1,), trigger="any_source")
     add(buf, 1, 100, 100, 5)

@@ -285,3 +285,10 @@ def test_never_worse_than_any_other_weights(
     others = np.concatenate([rng.dirichlet(np.ones(count), 20), np.eye(count)])
     tolerance = 1e-9 + 1e3 * EPS * 10.0**spread
     assert ours <= min(_value(infos, criterion, w) for w in others) + tolerance
+
+
+def test_equal_tracks_beside_others_in_a_batch() -> None:
+    """A fusion that is done at once waits for the rest of its batch, at which its system had no solution."""
+    cov = np.array([[1.0, 1.0, 2.0], [3.0, 3.0, 3.0], [4.0, 0.5, 1.0]])[..., None, None]
+    fused = fuse(np.zeros((3, 3, 1)), cov)
+    np.testing.assert_allclose(fused.cov[:, 0, 0], [1.0, 3.0, 0.5], rtol=1e-9)

@@ -28,7 +28,7 @@ def fuse(rule: str, params: str) -> None:
       "common"     what the tracks have in common: {"mean", "cov"} or {"components"}
       "target"     the density to come near to: likewise
       "cross_cov"  of two tracks: the matrix cov(x0, x1); of K: K rows of K such blocks, null where i >= j
-      "seed"       for a rule that samples
+      "seed"       for a rule that samples (absent: 0)
 
     \b
     Output: {"mean", "cov", "dof", "weights", "info", "components"}; null is: Gaussian, no weights, no mixture.
@@ -48,7 +48,7 @@ def fuse(rule: str, params: str) -> None:
     settings = from_dict(chosen.params, _read_params(params))
     if sys.stdin.isatty():
         click.echo("Reading tracks from the terminal; end with Ctrl-D.", err=True)
-    tracks = read_tracks(sys.stdin.buffer.read(), chosen.needs, chosen.key)
+    tracks = read_tracks(sys.stdin.buffer.read(), chosen.needed(settings), chosen.key, chosen.optional)
     print_json(write_fused(chosen(tracks, settings)))
 
 

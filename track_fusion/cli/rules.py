@@ -41,7 +41,8 @@ def describe(rule: Rule) -> dict[str, Any]:
     """Return what the registry says of a rule, its parameters included."""
     from track_fusion.cli.output import parameters
 
-    names = ("key", "title", "family", "arity", "guarantee", "caveat", "order_matters", "needs", "affine_equivariant")
+    names = ("key", "title", "family", "arity", "guarantee", "caveat", "order_matters", "needs",
+             "needs_when", "optional", "affine_equivariant")  # fmt: skip
     return {
         **{name: getattr(rule, name) for name in names},
         "source": rule.source,
@@ -55,6 +56,10 @@ def facts(rule: dict[str, Any]) -> list[tuple[str, str]]:
     lines = [("Guarantee", f"{rule['guarantee']}: {rule['caveat']}")]
     if rule["needs"]:
         lines.append(("Needs", ", ".join(rule["needs"])))
+    for name, parameter, value in rule["needs_when"]:
+        lines.append((f"Needs, with {parameter} {value}", name))
+    if rule["optional"]:
+        lines.append(("Can use", ", ".join(rule["optional"])))
     if rule["order_matters"]:
         lines.append(("Order", "the result depends on the order of the tracks"))
     if rule["affine_equivariant"] is not True:

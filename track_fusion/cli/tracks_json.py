@@ -40,7 +40,7 @@ class _Density:
         return len(self.mean)
 
 
-def read_tracks(text: bytes, needs: Iterable[str], rule: str) -> SourceTracks:
+def read_tracks(text: bytes, needs: Iterable[str], rule: str, optional: Iterable[str] = ()) -> SourceTracks:
     """Read the tracks that a rule is to fuse.
 
     Parameters
@@ -49,7 +49,8 @@ def read_tracks(text: bytes, needs: Iterable[str], rule: str) -> SourceTracks:
                    {"mean": n numbers, "cov": n x n} or {"components": [{"weight", "mean", "cov"}, ...]}, with "dof"
                    ("cov" is the covariance all the same; absent or null: Gaussian) and what the rule needs of
                    TRACK_EXTRAS
-    needs          names of the extras that the rule needs: the others are refused
+    needs          names of the extras that the rule needs: the others are refused, but for the
+    optional       ones
     rule           its key, for messages
 
     Returns
@@ -62,22 +63,24 @@ def read_tracks(text: bytes, needs: Iterable[str], rule: str) -> SourceTracks:
     ------
     InputError    a field is missing, unknown, not needed, of a wrong form, or holds a wrong value
     """
-    needs = tuple(needs)
+    needs, optional = tuple(needs), tuple(optional)
     data = _object(_parse(text), "standard input")
-    _check_names(data, "", ("tracks",), (), SHARED_EXTRAS, needs, rule)
+    _check_names(data, "", ("tracks",), (), SHARED_EXTRAS, needs, rule, optional)
     entries = _list(data["tracks"], "tracks", "a list of tracks")
     size: int | None = None
     densities, dofs = [], []
     for k, entry in enumerate(entries):
         path = f"tracks[{k}]"
         track = _object(entry, path)
-        _check_names(track, f"{path}.", (), (*DENSITY, "dof"), TRACK_EXTRAS, needs, rule)
+        _check_names(track, f"{path}.", (), (*DENSITY, "dof"), TRACK_EXTRAS, needs, rule, optional)
         densities.append(_density(track, path, size))
         size = densities[0].size
         dofs.append(_dof(track.get("dof"), f"{path}.dof"))
     cov = np.stack([d.cov for d in densities])
-    extras: dict[str, Any] = {n: _TRACK_READERS[n](entries, densities) for n in TRACK_EXTRAS if n in needs}
-    extras |= {n: _SHARED_READERS[n](data[n], n, densities) for n in SHARED_EXTRAS if n in needs}
+    given = {n for n in TRACK_EXTRAS if n in needs or (n in optional and all(n in e for e in entries))}
+    given |= {n for n in SHARED_EXTRAS if n in data}
+    extras: dict[str, Any] = {n: _TRACK_READERS[n](entries, densities) for n in TRACK_EXTRAS if n in given}
+    extras |= {n: _SHARED_READERS[n](data[n], n, densities) for n in SHARED_EXTRAS if n in given}
     return SourceTracks(
         np.stack([d.mean for d in densities]),
         cov,
@@ -151,13 +154,14 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _check_names(
     given: Mapping[str, Any], prefix: str, required: Iterable[str], allowed: Iterable[str],
-    extras: Iterable[str], needs: Iterable[str], rule: str,
+    extras: Iterable[str], needs: Iterable[str], rule: str, optional: Iterable[str] = (),
 ) -> None:  # fmt: skip
-    """Refuse what is unknown, what the rule does not need, and what is missing, in this order."""
+    """Refuse what is unknown, what the rule does not use, and what is missing, in this order."""
     needed = [name for name in extras if name in needs]
-    valid = (*required, *allowed, *needed)
+    used = [*needed, *(name for name in extras if name in optional)]
+    valid = (*required, *allowed, *used)
     for name in given:
-        if name in extras and name not in needed:
+        if name in extras and name not in used:
             _fail(f"{prefix}{name}", f"is nothing that rule '{rule}' uses")
         if name not in valid:
             _fail(f"{prefix}{name}", f"is unknown.{nearest(name, valid)} Valid: {', '.join(valid)}")

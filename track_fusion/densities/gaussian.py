@@ -69,6 +69,42 @@ def merge(mean: Array, cov: Array, weights: Array) -> tuple[Array, Array]:
     return merged_mean, merged_cov
 
 
+def merge_near(weight: Array, mean: Array, cov: Array, threshold: float) -> tuple[Array, Array, Array]:
+    """Merge the components of a mixture that are near to each other, directly or by way of others.
+
+    Parameters
+    ----------
+    weight : (..., C)
+    mean : (..., C, n)
+    cov : (..., C, n, n)
+    threshold : float       two components are near if (m_i - m_j)' (P_i + P_j)^-1 (m_i - m_j) < threshold^2
+
+    Returns
+    -------
+    weight, mean, cov    of the same shapes; a component that went into an earlier one has weight 0
+
+    Notes         Components of weight 0 join nothing, nor do particles (without covariance).
+    """
+    count, n = mean.shape[-2:]
+    total = cov[..., :, None, :, :] + cov[..., None, :, :, :]
+    solid = (weight > 0) & (np.trace(cov, axis1=-2, axis2=-1) > 0)
+    both = solid[..., :, None] & solid[..., None, :]
+    distance = mahalanobis_squared(
+        mean[..., :, None, :] - mean[..., None, :, :], np.where(both[..., None, None], total, np.eye(n))
+    )
+    near = (both & (distance < threshold**2)) | np.eye(count, dtype=bool)
+    for _ in range(max(count - 1, 1).bit_length()):  # near by way of others: each squaring doubles the way
+        near = near @ near
+    leader = near.argmax(-1)
+    member = weight[..., None, :] * (leader[..., None, :] == np.arange(count)[:, None])
+    merged = member.sum(-1)
+    share = np.where(merged[..., None] > 0, member, np.eye(count)) / np.where(merged > 0, merged, 1.0)[..., None]
+    centre = np.where(merged[..., None] > 0, share @ mean, mean)
+    spread = cov[..., None, :, :, :] + outer(mean[..., None, :, :] - centre[..., :, None, :])
+    joined = symmetrise((share[..., None, None] * spread).sum(-3))
+    return merged, centre, np.where(merged[..., None, None] > 0, joined, cov)
+
+
 def kl_divergence(mean: Array, cov: Array, other_mean: Array, other_cov: Array) -> Array:
     """Kullback-Leibler divergence of N(mean, cov) relative to N(other_mean, other_cov), in nats.
 

@@ -30,6 +30,8 @@ from track_fusion.nodes.ros_params import declare, refuse_unknown
 from track_fusion.params import ParameterError, Params, param
 
 DIAGNOSTICS_PERIOD_S = 1.0
+#: A signal takes effect on the context within this time.
+SIGNAL_LAG_S = 0.5
 #: How often a held-back message looks whether the clock and the subscribers are there.
 LOOK_PERIOD_S = 0.02
 #: So many messages are held back at most; later ones are rejected.
@@ -308,14 +310,22 @@ def run(make: Callable[[], ManagedNode]) -> int:
     except ParameterError as error:
         return _failed(str(error), 2)
     except Exception as error:
-        # When a signal comes while the node is being built, what it builds upon is gone; that is no fault.
-        if rclpy.utilities.ok():
+        # When a signal comes while the node is being built or waits, what it builds upon is gone; that is no fault.
+        if not _ending():
             if not isinstance(error, Fault):
                 raise
             return _failed(str(error), 1)
     finally:
         _close(node)
     return 0
+
+
+def _ending() -> bool:
+    """Tell whether a signal is ending this process: its errors may be seen a little before the context says so."""
+    deadline = time.monotonic() + SIGNAL_LAG_S
+    while rclpy.utilities.ok() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return not rclpy.utilities.ok()
 
 
 def _failed(text: str, code: int) -> int:

@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from track_fusion.densities.gaussian import merge
-from track_fusion.densities.pair import FEW, Pair, SinglePair
-from track_fusion.linalg import Array, logdet, transpose
-from track_fusion.optimise import (
-    Derivatives,
-    GradientHessian,
-    Solution,
-    minimise_on_interval,
-    minimise_on_simplex,
-    minimise_one,
-)
+from track_fusion.densities.bound_weights import bound_weights
+from track_fusion.densities.gaussian import merge, merge_near
+from track_fusion.densities.merging_weights import merging_weights
+from track_fusion.linalg import Array
+from track_fusion.optimise import Solution
 from track_fusion.params import Params, param
 from track_fusion.rules.base import FusedTracks, Mixture, Rule, SourceTracks, check_weights
-
-T = TypeVar("T", float, Array)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,8 +22,10 @@ class ArithmeticAverageParams(Params):
 
     criterion: str = param(
         "diversity",
-        "fusion weights: by diversity preference, eq. (40), uniform, or given by 'weights'",
-        choices=("diversity", "uniform", "given"),
+        "fusion weights: by diversity preference, eq. (40), by its bound, eq. (45), by the least divergence from a "
+        "target density, eq. (39), in proportion to the likelihood of each track's measurements, uniform, or given by "
+        "'weights'",
+        choices=("diversity", "bound", "target", "likelihood", "uniform", "given"),
     )
     weights: tuple[float, ...] = param(
         (), "fusion weights for criterion given, one a source, sum 1", low=0.0, high=1.0, kind=float
@@ -42,6 +34,12 @@ class ArithmeticAverageParams(Params):
         "merged",
         "merged: one Gaussian with the mixture's mean and covariance; mixture: the mixture, its modes preserved",
         choices=("merged", "mixture"),
+    )
+    merge_threshold: float = param(
+        0.0,
+        "in output mixture, components nearer to each other (also by way of others) are merged, the rest kept apart: "
+        "distance of the means in standard deviations of their difference",
+        low=0.0,
     )
 
 
@@ -53,7 +51,9 @@ def fuse(tracks: SourceTracks, params: ArithmeticAverageParams) -> FusedTracks:
 
     Parameters
     ----------
-    tracks : SourceTracks    mean (..., K, n), cov (..., K, n, n); mixtures are averaged as mixtures
+    tracks : SourceTracks    mean (..., K, n), cov (..., K, n, n); mixtures are averaged as mixtures. Extras: for
+                             criterion target `target`, a Mixture of leading shape (...) or none, taken by its moments;
+                             for criterion likelihood `likelihood` (..., K), not negative
     params : ArithmeticAverageParams
 
     Returns
@@ -62,28 +62,35 @@ def fuse(tracks: SourceTracks, params: ArithmeticAverageParams) -> FusedTracks:
 
     Raises
     ------
-    ValueError    given weights do not fit
+    ValueError    given weights or likelihoods do not fit
 
-    Notes          Weights by diversity depend on the means, for which the promise is not proved. The
-                   diversity program (40) is the concave maximisation of log det P_AA(w) minus the mean log
-                   det P_i; at its interior optimum all divergences (37) are equal. O(K n^3).
+    Notes          Weights by diversity, its bound, a target or likelihoods depend on the means, for which the promise
+                   is not proved. The programs (39) and (40) are convex in the weights; at an interior optimum of (40)
+                   all divergences (37) are equal. (45) may have several minima; the best found is taken. Where all
+                   likelihoods are zero, all tracks weigh the same. O(K n^3).
     References     T. Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average
-                   Density Fusion, eqs. (6), (10)-(11), (37), (40).
+                   Density Fusion, eqs. (6), (10)-(11), (37), (39), (40), (45), section II-E.
     """
-    batch, (count, n) = tracks.mean.shape[:-2], tracks.mean.shape[-2:]
-    info: dict[str, NDArray[np.bool_] | NDArray[np.intp]] = {}
+    batch, count = tracks.mean.shape[:-2], tracks.count
+    info: dict[str, Any] = {}
     if params.weights and params.criterion != "given":
         raise ValueError(f"The 'weights' parameter needs criterion 'given'. Got criterion {params.criterion!r}.")
     if params.criterion == "given":
         weights = np.broadcast_to(check_weights(params.weights, count), (*batch, count))
+    elif params.criterion == "likelihood":
+        weights = _by_likelihood(tracks)
     elif params.criterion == "uniform" or count == 1:
         weights = np.full((*batch, count), 1.0 / count)
     else:
-        found = diversity_weights(tracks.mean.reshape(-1, count, n), tracks.cov.reshape(-1, count, n, n))
+        found = _sought(tracks, params.criterion)
         weights = found.weights.reshape(*batch, count)
         info = {"converged": found.converged.reshape(batch), "iterations": found.iterations.reshape(batch)}
     mean, cov = merge(tracks.mean, tracks.cov, weights)
-    mixture = _mixture(tracks, weights) if params.output == "mixture" else None
+    mixture = None
+    if params.output == "mixture":
+        mixture = _mixture(tracks, weights)
+        if params.merge_threshold > 0:
+            mixture = Mixture(*merge_near(mixture.weight, mixture.mean, mixture.cov, params.merge_threshold))
     return FusedTracks(mean, cov, weights, mixture=mixture, info=info)
 
 
@@ -96,104 +103,37 @@ def _mixture(tracks: SourceTracks, weights: Array) -> Mixture:
     return Mixture(weight, part.mean.reshape(*batch, -1, n), part.cov.reshape(*batch, -1, n, n))
 
 
-def diversity_weights(mean: Array, cov: Array) -> Solution:
-    """Find the weights of diversity preference, Li 2022 (40), of a flat batch.
-
-    Parameters
-    ----------
-    mean : (B, K, n)
-    cov : (B, K, n, n)
-
-    Returns
-    -------
-    Solution    weights (B, K); uniform where all tracks are equal
-    """
-    if mean.shape[1] > 2:
-        return minimise_on_simplex(_gradient_hessian(mean, cov), len(mean), mean.shape[1])
-    if 0 < len(mean) <= FEW:
-        return Solution.concatenate([_single_weights(m, c) for m, c in zip(mean, cov, strict=True)])
-    found = minimise_on_interval(_pair_derivatives(mean, cov), len(mean))
-    return Solution(np.stack([found.weights, 1.0 - found.weights], -1), found.converged, found.iterations)
+def _sought(tracks: SourceTracks, criterion: str) -> Solution:
+    """Find the weights of a program, of a flat batch."""
+    count, n = tracks.mean.shape[-2:]
+    mean, cov = tracks.mean.reshape(-1, count, n), tracks.cov.reshape(-1, count, n, n)
+    if criterion == "bound":
+        return bound_weights(mean, cov)
+    return merging_weights(mean, cov, None if criterion == "diversity" else _target_slopes(tracks).reshape(-1, count))
 
 
-def _pair_derivatives(mean: Array, cov: Array) -> Derivatives:
-    """Derivatives over the weight of track 1 of mean log det P_i - log det P_AA, both covariances diagonal.
-
-    In these axes P_AA = D + w (1 - w) e e', D = w P1 + (1 - w) P2, whose determinant is det D times
-    1 + w (1 - w) q with q = e' D^-1 e.
-    """
-    pair = Pair.of(cov[:, 0], cov[:, 1])
-    second, change = pair.second, -pair.contrast
-    square = pair.coordinates(mean[:, 0] - mean[:, 1]) ** 2
-    entropy = np.where(change == 0.0, 0.0, np.log(pair.first) - np.log(second)).sum(0)
-
-    def derivatives(w: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
-        whole = len(rows) == second.shape[1]
-        p2, c, e2 = (second, change, square) if whole else (second[:, rows], change[:, rows], square[:, rows])
-        d = p2 + w * c
-        rate, share = c / d, e2 / d
-        fall = share * rate
-        slope, curvature = _join(w, rate.sum(0), (rate * rate).sum(0), share.sum(0), fall.sum(0), (fall * rate).sum(0))
-        return (entropy if whole else entropy[rows]) + slope, curvature
-
-    return derivatives
+def _target_slopes(tracks: SourceTracks) -> Array:
+    """Linear part of (39), (..., K): tr(P^-1 (P_i + (x_i - x)(x_i - x)')) for a target of moments x, P."""
+    target: Mixture = tracks.extras["target"]
+    mean, cov = merge(target.mean, target.cov, target.weight / target.weight.sum(-1, keepdims=True))
+    offset = tracks.mean - mean[..., None, :]
+    second = tracks.cov + offset[..., :, None] * offset[..., None, :]
+    slopes = np.trace(np.linalg.solve(cov[..., None, :, :], second), axis1=-2, axis2=-1)
+    return np.asarray(slopes, np.float64)
 
 
-def _single_weights(mean: Array, cov: Array) -> Solution:
-    """Find the weights of one pair, mean (2, n), as a batch of one; in plain numbers where no axis is very sharp."""
-    pair = SinglePair.of(cov[0], cov[1])
-    if pair is None:
-        found = minimise_on_interval(_pair_derivatives(mean[None], cov[None]), 1)
-        return Solution(np.stack([found.weights, 1.0 - found.weights], -1), found.converged, found.iterations)
-    square = ((pair.inverse @ (mean[0] - mean[1])) ** 2).tolist()
-    axes = [(q, -c, e) for q, c, e in zip(pair.second, pair.contrast, square, strict=True)]
-    entropy = sum(math.log((q + c) / q) for q, c, _ in axes)
-
-    def derivatives(w: float) -> tuple[float, float]:
-        a = b = q = r = s = 0.0
-        for p2, c, e2 in axes:
-            d = p2 + w * c
-            rate, share = c / d, e2 / d
-            fall = share * rate
-            a, b, q, r, s = a + rate, b + rate * rate, q + share, r + fall, s + fall * rate
-        slope, curvature = _join(w, a, b, q, r, s)
-        return entropy + slope, curvature
-
-    omega, converged, iterations = minimise_one(derivatives)
-    return Solution(np.array([[omega, 1.0 - omega]]), np.array([converged]), np.array([iterations]))
-
-
-def _join(w: T, rate: T, square: T, q: T, fall: T, fall_rate: T) -> tuple[T, T]:
-    """Derivatives of -log det D - log(1 + w (1 - w) q) from sums over axes; those of q are -fall and 2 fall_rate."""
-    v, dv = w * (1.0 - w), 1.0 - 2.0 * w
-    psi = 1.0 + v * q
-    rise = (dv * q - v * fall) / psi
-    bend = (2.0 * v * fall_rate - 2.0 * q - 2.0 * dv * fall) / psi
-    return -rate - rise, square - bend + rise * rise
-
-
-def _gradient_hessian(mean: Array, cov: Array) -> GradientHessian:
-    """Gradient and Hessian over the weights of mean log det P_i - log det P_AA."""
-    batch, count, n = mean.shape
-    lower = np.linalg.cholesky(cov.sum(1))
-    whiten = np.linalg.inv(lower)[:, None]
-    white = whiten @ cov @ transpose(whiten)
-    points = (whiten @ (mean - mean.mean(1, keepdims=True))[..., None])[..., 0]
-    entropy = logdet(white)
-
-    def gradient_hessian(w: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
-        x = points[rows]
-        centred = x - np.einsum("bk,bki->bi", w, x)[:, None]
-        spread = white[rows] + centred[..., :, None] * centred[..., None, :]
-        info = np.linalg.inv(np.einsum("bk,bkij->bij", w, spread))[:, None]
-        # On the simplex the derivative of P_AA along w_i is P_i + (x_i - x)(x_i - x)', up to a common term.
-        step = info @ spread
-        gradient = entropy[rows] - np.trace(step, axis1=-2, axis2=-1)
-        flat = step.reshape(len(w), count, n * n), transpose(step).reshape(len(w), count, n * n)
-        curvature = flat[0] @ transpose(flat[1]) + 2.0 * centred @ info[:, 0] @ transpose(centred)
-        return gradient, curvature
-
-    return gradient_hessian
+def _by_likelihood(tracks: SourceTracks) -> Array:
+    """Weights in proportion to the likelihoods, equal where all are zero, (..., K)."""
+    likelihood = np.asarray(tracks.extras["likelihood"], float)
+    if likelihood.shape != tracks.mean.shape[:-1]:
+        raise ValueError(
+            f"The 'likelihood' of source tracks must have shape {tracks.mean.shape[:-1]}. Got {likelihood.shape}."
+        )
+    if not (np.isfinite(likelihood) & (likelihood >= 0)).all():
+        raise ValueError(f"The 'likelihood' of source tracks must be finite and not negative. Got {likelihood.min()}.")
+    largest = likelihood.max(-1, keepdims=True)
+    share = np.where(largest > 0, likelihood, 1.0) / np.where(largest > 0, largest, 1.0)
+    return np.asarray(share / share.sum(-1, keepdims=True))
 
 
 RULE = Rule(
@@ -205,6 +145,7 @@ RULE = Rule(
     arity="n_ary",
     guarantee="conservative",
     caveat="merged, at weights that do not depend on the means (uniform, given), if every track is",
-    source="Li 2022 (6), (10)-(11), (40)",
-    cost="K n^3, about ten times that for diversity with K > 2",
+    source="Li 2022 (6), (10)-(11), (39), (40), (45)",
+    cost="K n^3, about ten times that for weights that are sought with K > 2",
+    needs_when=(("target", "criterion", "target"), ("likelihood", "criterion", "likelihood")),
 )

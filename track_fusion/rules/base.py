@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from track_fusion.densities.mixture import Mixture as Mixture
 from track_fusion.linalg import ASYMMETRY_TOLERANCE, Array, is_positive_definite, symmetrise, transpose
 from track_fusion.params import Params
 
@@ -16,15 +17,6 @@ Arity = Literal["n_ary", "pairwise"]
 #: conservative: for every admissible cross-correlation, at weights that do not depend on the means;
 #: structural: only under the correlation structure it assumes; exact: what it needs is given.
 Guarantee = Literal["conservative", "structural", "exact", "none"]
-
-
-@dataclasses.dataclass(frozen=True)
-class Mixture:
-    """A stack of Gaussian mixtures: weight (..., C), mean (..., C, n), cov (..., C, n, n)."""
-
-    weight: Array
-    mean: Array
-    cov: Array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +81,9 @@ class Rule:
     cost: str  # operations a fusion, in K sources of n axes
     order_matters: bool = False
     needs: tuple[str, ...] = ()  # names of `extras`
+    #: (extra, parameter, value): needed as well when the parameter has this value, and of no use otherwise
+    needs_when: tuple[tuple[str, str, str], ...] = ()
+    optional: tuple[str, ...] = ()  # names of `extras` that are used when given
     affine_equivariant: bool | str = True  # a string says why not, or under which parameters
     linear: bool = False  # the fused mean is linear in the means; all else depends on the covariances alone
 
@@ -100,10 +95,15 @@ class Rule:
         ValueError    the tracks are malformed, or lack what the rule needs
         """
         check_tracks(tracks)
-        missing = [name for name in self.needs if name not in tracks.extras]
+        params = self.params() if params is None else params
+        missing = [name for name in self.needed(params) if name not in tracks.extras]
         if missing:
             raise ValueError(f"The rule '{self.key}' needs '{missing[0]}' beside the tracks. Got none.")
-        return self.fuse(tracks, self.params() if params is None else params)
+        return self.fuse(tracks, params)
+
+    def needed(self, params: Params) -> tuple[str, ...]:
+        """Names of the extras without which the rule cannot do at these parameters."""
+        return (*self.needs, *(name for name, key, value in self.needs_when if getattr(params, key) == value))
 
 
 def check_weights(weights: tuple[float, ...], count: int, total: float = 1.0) -> Array:

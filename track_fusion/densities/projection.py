@@ -1,0 +1,286 @@
+"""The mean nearest to K densities by projection distances arccosh(1 + c d_k): Chen and Zhou 2022, section 4.1.
+
+d_k is the squared Mahalanobis distance of the mean from density k.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from track_fusion.linalg import Array, inverse, matvec, outer, transpose
+
+MAX_STEPS = 200
+#: A step this short, in standard deviations, or this part of the farthest distance, ends a descent.
+SHORT_STEP, ROUNDING = 1e-9, 1e-14
+#: Squared criterion: arccosh(1 + c d)^2 is convex in the mean while arccosh <= 2 x, x tanh x = 1. A minimum whose
+#: sum of squares is below (2 x)^2 lies where every term is convex, outside which one term alone is larger: no
+#: other minimum is lower.
+CERTAIN = (2.0 * 1.1996786402577339) ** 2
+#: Unsquared criterion: a descent leaves an estimate by this many standard deviations.
+LEAVE = 1e-3
+#: An estimate is the minimum if no descent ends lower than it by more than this part.
+TIE = 1e-10
+#: An estimate this near, in squared standard deviations, is where the mean is.
+HERE = 1e-18
+
+
+@dataclasses.dataclass(frozen=True)
+class ProjectionMean:
+    """Nearest means of a batch.
+
+    Attributes
+    ----------
+    mean : (B, n)
+    weights : (B, K)       omega_k of (45), normalised; one at an estimate the mean is snapped to
+    distance : (B, K)      d_k
+    snapped : (B,)         source whose estimate is the mean, -1 = none
+    objective : (B,)       the minimised sum
+    converged : (B,)
+    iterations : (B,)      steps of the descent that led to the mean
+    """
+
+    mean: Array
+    weights: Array
+    distance: Array
+    snapped: NDArray[np.intp]
+    objective: Array
+    converged: NDArray[np.bool_]
+    iterations: NDArray[np.intp]
+
+
+def nearest_mean(mean: Array, cov: Array, pull: Array, squared: bool) -> ProjectionMean:
+    """Minimise the sum over k of arccosh(1 + c d_k), or of its square, over the fused mean, eq. (39).
+
+    Parameters
+    ----------
+    mean : (B, K, n)
+    cov : (B, K, n, n)    by which distances d_k are taken
+    pull : (B,)           c
+    squared : bool        minimise the sum of squares
+
+    Returns
+    -------
+    ProjectionMean
+
+    Raises
+    ------
+    LinAlgError    a matrix is singular
+
+    Notes         Iteration (47) lowers the sum at every step, since each term is concave in d_k; a step of
+                  Newton's method replaces it where it lowers the sum further. The squared sum is smooth; it starts at
+                  the uniform intersection, and again from every estimate unless the first minimum is
+                  certainly the lowest. The plain sum has a kink at every estimate x_k, where (48) is infinite: x_k
+                  is a local minimum iff sqrt(G' P_k G) <= sqrt(2 c), G the gradient of the other terms. Every
+                  estimate competes, and a descent starts beside each that is none.
+    References    Z. Chen and J. Zhou, Multisensor Estimation Fusion on Statistical Manifold, 2022, eqs.
+                  (39)-(48), Theorem 4; weights (46) are those of (48), for squares phi times its derivative.
+    """
+    batch, count, n = mean.shape
+    if count == 1:
+        zeros = np.zeros((batch, 1))
+        return ProjectionMean(mean[:, 0].copy(), zeros + 1.0, zeros, np.zeros(batch, np.intp), zeros[:, 0],
+                              np.ones(batch, bool), np.zeros(batch, np.intp))  # fmt: skip
+    lower = np.linalg.cholesky(cov.sum(1))
+    whiten = np.linalg.inv(lower)[:, None]
+    white = whiten @ cov @ transpose(whiten)
+    origin = mean[:, 0]
+    points = matvec(whiten, mean - origin[:, None])
+    terms = _Terms(points, inverse(white), pull, squared)
+    found = _squared(terms) if squared else _unsquared(terms, white)
+    nearest = origin + matvec(lower, found.at)
+    snapped = np.flatnonzero(found.snapped >= 0)
+    nearest[snapped] = mean[snapped, found.snapped[snapped]]
+    return ProjectionMean(
+        nearest, found.weights(terms), found.state.distance, found.snapped,
+        found.state.value, found.converged, found.iterations,
+    )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class _State:
+    """What a mean (P, n) costs: value (P,), distances (P, K), and I_k (mean - x_k), (P, K, n)."""
+
+    value: Array
+    distance: Array
+    force: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class _Terms:
+    """The terms of P sums: x_k (P, K, n), inverse covariances (P, K, n, n), c (P,)."""
+
+    points: Array
+    info: Array
+    pull: Array
+    squared: bool
+
+    def __getitem__(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> _Terms:
+        return _Terms(self.points[rows], self.info[rows], self.pull[rows], self.squared)
+
+    def state(self, at: Array) -> _State:
+        residual = at[:, None] - self.points
+        force = matvec(self.info, residual)
+        distance = np.maximum((residual * force).sum(-1), 0.0)
+        z = self.pull[:, None] * distance
+        length = np.log1p(z + np.sqrt(z * (z + 2.0)))
+        return _State((length**2 if self.squared else length).sum(-1), distance, force)
+
+    def slopes(self, distance: Array) -> tuple[Array, Array]:
+        """Derivatives of each term over z = c d_k: infinite at an estimate if not squared."""
+        z = self.pull[:, None] * distance
+        sinh = np.sqrt(z * (z + 2.0))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if not self.squared:
+                return 1.0 / sinh, -(1.0 + z) / sinh**3
+            length = np.log1p(z + sinh)
+            slope = np.where(sinh > 0, length / sinh, 1.0)
+            bend = np.where(z > 1e-6, (1.0 - slope * (1.0 + z)) / sinh**2, -1.0 / 3.0)
+        return 2.0 * slope, 2.0 * bend
+
+
+@dataclasses.dataclass(frozen=True)
+class _Minimum:
+    """Candidates for the minima of P sums, and how they came about."""
+
+    at: Array
+    state: _State
+    snapped: NDArray[np.intp]
+    converged: NDArray[np.bool_]
+    iterations: NDArray[np.intp]
+
+    def replaced(self, rows: NDArray[np.intp], other: _Minimum) -> _Minimum:
+        """Put the rows of another in place of these rows."""
+        for mine, theirs in zip(self._arrays(), other._arrays(), strict=True):
+            mine[rows] = theirs
+        return self
+
+    def __getitem__(self, rows: NDArray[np.bool_]) -> _Minimum:
+        at, *state, snapped, converged, iterations = (array[rows] for array in self._arrays())
+        return _Minimum(at, _State(*state), snapped, converged, iterations)
+
+    def _arrays(self) -> tuple[NDArray[Any], ...]:
+        state = self.state
+        return self.at, state.value, state.distance, state.force, self.snapped, self.converged, self.iterations
+
+    def weights(self, terms: _Terms) -> Array:
+        slope, _ = terms.slopes(self.state.distance)
+        one = np.arange(slope.shape[1]) == self.snapped[:, None]
+        slope = np.where((self.snapped >= 0)[:, None], one, slope)
+        return np.asarray(slope / slope.sum(-1, keepdims=True))
+
+
+def _squared(terms: _Terms) -> _Minimum:
+    best = _descend(terms, _intersection(terms, np.ones(terms.points.shape[:2])))
+    for source in range(terms.points.shape[1]):
+        doubtful = np.flatnonzero(best.state.value > CERTAIN)
+        if not len(doubtful):
+            break
+        part = terms[doubtful]
+        other = _descend(part, part.points[:, source])
+        lower = other.state.value < best.state.value[doubtful] * (1.0 - TIE)
+        best = best.replaced(doubtful[lower], other[lower])
+    return best
+
+
+def _unsquared(terms: _Terms, white: Array) -> _Minimum:
+    batch, count, _ = terms.points.shape
+    best = _descend(terms, _intersection(terms, np.ones((batch, count))))
+    for source in range(count):
+        here = terms.points[:, source]
+        direction = _way_down(terms, white, source)
+        rows = np.flatnonzero(direction.any(-1))
+        if len(rows):
+            other = _descend(terms[rows], here[rows] + LEAVE * direction[rows])
+            lower = other.state.value < best.state.value[rows] * (1.0 - TIE)
+            best = best.replaced(rows[lower], other[lower])
+    states = [terms.state(terms.points[:, source]) for source in range(count)]
+    source = np.stack([s.value for s in states]).argmin(0)
+    here = np.take_along_axis(terms.points, source[:, None, None], 1)[:, 0]
+    sure = np.ones(batch, bool)
+    snap = _Minimum(here, terms.state(here), source, sure, best.iterations.copy())
+    # The mean is that estimate, not a point reached to rounding, wherever no descent ends lower.
+    at_it = snap.state.value <= best.state.value * (1.0 + TIE)
+    return best.replaced(np.flatnonzero(at_it), snap[at_it])
+
+
+def _way_down(terms: _Terms, white: Array, source: int) -> Array:
+    """Steepest way down from an estimate, one standard deviation long, (B, n); zero where it is a local minimum.
+
+    The kinks of estimates that coincide add up.
+    """
+    state = terms.state(terms.points[:, source])
+    apart = state.distance > HERE
+    slope = np.where(apart, terms.slopes(state.distance)[0], 0.0)
+    gradient = 2.0 * (terms.pull[:, None] * slope)[..., None] * state.force
+    gradient = np.where(apart[..., None], gradient, 0.0).sum(1)
+    image = matvec(white, gradient[:, None])
+    size = np.sqrt(np.maximum((image * gradient[:, None]).sum(-1), 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # sum of sqrt(2 c) / |G|_k over the kinks here: at least one where they hold the mean.
+        hold = np.where(apart, 0.0, np.sqrt(2.0 * terms.pull)[:, None] / size).sum(-1)
+        direction = -image[:, source] / size[:, source, None]
+    return np.where((hold < 1.0)[:, None], direction, 0.0)
+
+
+def _intersection(terms: _Terms, weights: Array) -> Array:
+    """Mean (45) at these weights, (P, n)."""
+    info = weights[..., None, None] * terms.info
+    return np.asarray(np.linalg.solve(info.sum(1), matvec(info, terms.points).sum(1)[..., None])[..., 0])
+
+
+def _descend(terms: _Terms, start: Array) -> _Minimum:
+    """Follow each sum down from its start, (P, n), by (47) and Newton's method."""
+    batch = len(start)
+    found = _Minimum(start.copy(), terms.state(start), np.full(batch, -1, np.intp), np.zeros(batch, bool),
+                     np.zeros(batch, np.intp))  # fmt: skip
+    rows, part, at, state = np.arange(batch), terms, start, terms.state(start)
+    metric = terms.info.mean(1)
+    for step in range(1, MAX_STEPS + 1):
+        if not len(rows):
+            break
+        new, new_state, halted = _step(part, at, state)
+        move = new - at
+        length = np.sqrt(np.maximum((move * matvec(metric, move)).sum(-1), 0.0))
+        done = halted | (length <= SHORT_STEP + ROUNDING * np.sqrt(new_state.distance.max(-1)))
+        at, state = new, new_state
+        if done.any() or step == MAX_STEPS:
+            out = done | (step == MAX_STEPS)
+            found.replaced(rows[out], _Minimum(at[out], _State(state.value[out], state.distance[out], state.force[out]),
+                           np.full(out.sum(), -1), done[out], np.full(out.sum(), step)))  # fmt: skip
+            left = ~out
+            rows, part, at, metric = rows[left], part[left], at[left], metric[left]
+            state = _State(state.value[left], state.distance[left], state.force[left])
+    return found
+
+
+def _step(terms: _Terms, at: Array, state: _State) -> tuple[Array, _State, NDArray[np.bool_]]:
+    """Take the better of (47) and a step of Newton's method; halt at an estimate that has a kink."""
+    halted: NDArray[np.bool_] = np.asarray((state.distance <= HERE).any(-1) & (not terms.squared))
+    slope, bend = terms.slopes(np.where(halted[:, None], 1.0, state.distance))
+    pull = terms.pull[:, None]
+    gradient = (slope[..., None] * state.force).sum(1)
+    tame = (slope[..., None, None] * terms.info).sum(1)
+    hessian = tame + 2.0 * ((pull * bend)[..., None, None] * outer(state.force)).sum(1)
+    moves = [_solve(matrix, gradient) for matrix in (tame, hessian)]
+    plain, newton = (np.where(halted[:, None], at, at - move) for move in moves)
+    plain_state, newton_state = terms.state(plain), terms.state(newton)
+    better = newton_state.value <= plain_state.value
+    new = np.where(better[:, None], newton, plain)
+    pairs = zip(vars(newton_state).values(), vars(plain_state).values(), strict=True)
+    value, distance, force = (np.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs)
+    return new, _State(value, distance, force), halted
+
+
+def _solve(matrix: Array, right: Array) -> Array:
+    """Solve, giving infinity where a matrix is singular: no candidate."""
+    try:
+        return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0])
+    except np.linalg.LinAlgError:
+        if len(matrix) == 1:
+            return np.full_like(right, np.inf)
+        half = len(matrix) // 2
+        return np.concatenate([_solve(matrix[:half], right[:half]), _solve(matrix[half:], right[half:])])

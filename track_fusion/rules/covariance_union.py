@@ -1,0 +1,109 @@
+"""Covariance union: a covariance that covers every track, also those that contradict each other."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal, cast
+
+import numpy as np
+
+from track_fusion.densities.upper_bound import Bound, bound_about, bound_anywhere
+from track_fusion.linalg import Array, outer
+from track_fusion.params import Params, param
+from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
+
+
+@dataclasses.dataclass(frozen=True)
+class CovarianceUnionParams(Params):
+    """Which bound of the tracks is taken, and about which mean."""
+
+    bound: str = param(
+        "optimal",
+        "optimal: the smallest covariance not below any P_i + (x - x_i)(x - x_i)'; max_trace, min_trace: the one of "
+        "them with the largest or smallest trace, eqs. (8) and (9) as printed, which need not bound the others",
+        choices=("optimal", "max_trace", "min_trace"),
+    )
+    criterion: str = param(
+        "det",
+        "what is smallest of the optimal bound: its determinant (does not depend on units) or its trace (does)",
+        choices=("det", "trace"),
+    )
+    mean: str = param(
+        "arithmetic",
+        "x: the arithmetic mean of the tracks, or the one whose optimal bound is smallest",
+        choices=("arithmetic", "optimal"),
+    )
+    weights: tuple[float, ...] = param(
+        (), "weights of the arithmetic mean, one a source, sum 1; none: equal", low=0.0, high=1.0, kind=float
+    )
+
+
+def fuse(tracks: SourceTracks, params: CovarianceUnionParams) -> FusedTracks:
+    """Fuse K tracks by covariance union: P >= P_i + (x - x_i)(x - x_i)' for all i.
+
+    Conservative if at least one of the tracks is, whichever it may be: fault-tolerant.
+
+    Parameters
+    ----------
+    tracks : SourceTracks    mean (..., K, n), cov (..., K, n, n)
+    params : CovarianceUnionParams
+
+    Returns
+    -------
+    FusedTracks    mean (..., n), cov (..., n, n), weights (..., K) of the arithmetic mean, info converged, iterations
+
+    Raises
+    ------
+    ValueError     weights do not fit, or the optimal mean is asked for a bound that is not optimal
+    LinAlgError    a covariance is singular
+
+    Notes          There is no least upper bound in the Loewner order: the one of least determinant or trace is
+                   taken. max_trace breaks the promise: with P1 = diag(1, 4) and P2 = diag(5, 1) at one mean it is
+                   P2, and the error variance of a right track 1 is 4 times the claim along the second axis. The optimal
+                   mean depends on the means in a way for which the promise holds track by track, given the estimates.
+                   Two tracks about the arithmetic mean have a closed form, O(n^3); more, or
+                   the optimal mean, take some twelve steps of an interior point, O(K n^6) each.
+    References     T. Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average
+                   Density Fusion, eqs. (7)-(9).
+    """
+    batch, (count, n) = tracks.mean.shape[:-2], tracks.mean.shape[-2:]
+    means, covs = tracks.mean.reshape(-1, count, n), tracks.cov.reshape(-1, count, n, n)
+    criterion = cast(Literal["det", "trace"], params.criterion)
+    if params.mean == "optimal":
+        if params.bound != "optimal" or params.weights:
+            wrong = f"bound {params.bound!r}" if params.bound != "optimal" else f"weights {params.weights}"
+            raise ValueError(f"The 'mean' parameter 'optimal' needs bound 'optimal' and no weights. Got {wrong}.")
+        return _shaped(bound_anywhere(means, covs, criterion), batch, None)
+    share = check_weights(params.weights, count) if params.weights else np.full(count, 1.0 / count)
+    origin = means[:, 0]
+    mean = origin + share @ (means - origin[:, None])
+    weights = np.broadcast_to(share, (*batch, count))
+    if params.bound == "optimal":
+        return _shaped(bound_about(mean, means, covs, criterion), batch, weights)
+    sides = covs + outer(mean[:, None] - means)
+    traces = np.trace(sides, axis1=-2, axis2=-1)
+    chosen = traces.argmax(1) if params.bound == "max_trace" else traces.argmin(1)
+    cov = sides[np.arange(len(sides)), chosen]
+    return FusedTracks(mean.reshape(*batch, n), cov.reshape(*batch, n, n), weights)
+
+
+def _shaped(found: Bound, batch: tuple[int, ...], weights: Array | None) -> FusedTracks:
+    n = found.mean.shape[-1]
+    info = {"converged": found.converged.reshape(batch), "iterations": found.iterations.reshape(batch)}
+    return FusedTracks(found.mean.reshape(*batch, n), found.cov.reshape(*batch, n, n), weights, info=info)
+
+
+RULE = Rule(
+    key="covariance_union",
+    title="Covariance union",
+    fuse=fuse,
+    params=CovarianceUnionParams,
+    family="gaussian",
+    arity="n_ary",
+    guarantee="conservative",
+    caveat="with bound optimal and the arithmetic mean, if at least one track is; max_trace and min_trace promise "
+    "nothing",
+    source="Li 2022 (7)-(9)",
+    cost="n^3 for K = 2, else some twelve times K n^6",
+    affine_equivariant="not with a trace, whether as criterion or as bound: it depends on the units of the axes",
+)

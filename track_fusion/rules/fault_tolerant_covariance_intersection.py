@@ -1,0 +1,65 @@
+"""Fault-tolerant covariance intersection: weights that sum to less than one."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from track_fusion.params import param
+from track_fusion.rules import covariance_intersection
+from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
+
+
+@dataclasses.dataclass(frozen=True)
+class FaultTolerantCovarianceIntersectionParams(covariance_intersection.CovarianceIntersectionParams):
+    """How the weights are chosen, as for covariance intersection, and what they sum to."""
+
+    delta: float = param(
+        0.9, "what the weights sum to: the covariance is that of covariance intersection over delta",
+        low=0.0, high=1.0, strict=True,
+    )  # fmt: skip
+
+
+def fuse(tracks: SourceTracks, params: FaultTolerantCovarianceIntersectionParams) -> FusedTracks:
+    """Fuse K Gaussian tracks by fault-tolerant convex combination (FFCC): weights that sum to delta <= 1.
+
+    Conservative for every cross-correlation, also when the covariances of the tracks are too small by a factor of up
+    to delta.
+
+    Parameters
+    ----------
+    tracks : SourceTracks    mean (..., K, n), cov (..., K, n, n)
+    params : FaultTolerantCovarianceIntersectionParams
+
+    Returns
+    -------
+    FusedTracks    mean (..., n), cov (..., n, n), weights (..., K) of sum delta, info converged, iterations
+
+    Raises
+    ------
+    ValueError     given weights do not fit (they sum to 1 before they are multiplied by delta)
+    LinAlgError    a covariance is singular
+
+    Notes          The mean is that of covariance intersection, the covariance P_CI / delta. One track alone comes
+                   back as it is: nothing is combined. O(K n^3).
+    References     T. Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average
+                   Density Fusion, section II-C, (19).
+    """
+    fused = covariance_intersection.fuse(tracks, params)
+    if tracks.count == 1 or fused.weights is None:
+        return fused
+    return dataclasses.replace(fused, cov=fused.cov / params.delta, weights=fused.weights * params.delta)
+
+
+RULE = Rule(
+    key="fault_tolerant_covariance_intersection",
+    title="Fault-tolerant covariance intersection",
+    fuse=fuse,
+    params=FaultTolerantCovarianceIntersectionParams,
+    family="gaussian",
+    arity="n_ary",
+    guarantee="conservative",
+    caveat="if every track is, or is too small by a factor of at most delta; for every cross-correlation",
+    source="Li 2022 II-C",
+    cost="as covariance intersection",
+    affine_equivariant="not with criterion trace: the trace depends on the units of the axes",
+)

@@ -1,0 +1,93 @@
+"""Geometric mean density by sampling: covariance intersection for densities of any shape."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from numpy.typing import NDArray
+
+from track_fusion.densities.mean_density import fit_mean_density, sample_mean_density
+from track_fusion.densities.mixture import chosen
+from track_fusion.params import param
+from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
+from track_fusion.rules.mixture_common import (
+    ReductionParams,
+    all_same,
+    average_weights,
+    fused_tracks,
+    naive_product,
+    nth,
+    seeded,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class GeometricMeanSamplingParams(ReductionParams):
+    """The fusion weights, the samples and the number of components."""
+
+    criterion: str = param(
+        "uniform", "fusion weights: all equal (uniform), or given by 'weights'", choices=("uniform", "given")
+    )
+    weights: tuple[float, ...] = param(
+        (), "fusion weights for criterion given, one a source, sum 1", low=0.0, high=1.0, kind=float
+    )
+    samples: int = param(5000, "samples in all", low=10)
+    inflation: float = param(
+        1.0, "alpha: factor on the covariances that samples are drawn from; above 1 it widens the result", low=1.0
+    )
+
+
+def fuse(tracks: SourceTracks, params: GeometricMeanSamplingParams) -> FusedTracks:
+    """Fuse K Gaussian tracks or mixtures by the geometric mean of their densities, sampled (GMD-S).
+
+    f is proportional to the product of f_i^w_i; its moments are those of weighted samples.
+
+    Parameters
+    ----------
+    tracks : SourceTracks    mean (..., K, n), cov (..., K, n, n), or mixture (..., K, C), normalised first;
+                             extras["seed"]: int or Generator, 0 if absent
+    params : GeometricMeanSamplingParams
+
+    Returns
+    -------
+    FusedTracks    mean (..., n), cov (..., n, n), weights (..., K), the mixture for mixtures; info ess (share of
+                   samples that are effective), log_eta (log of the integral of the product: very low where the
+                   densities are disjoint)
+
+    Raises
+    ------
+    ValueError     given weights do not fit, or a component has no covariance
+
+    Notes          Of Gaussian tracks the limit for many samples is covariance intersection at these weights, which is
+                   conservative; but each sampled variance errs by about its square root of 2 / S_eff: fifty
+                   samples of seed 0 for two tracks of variance 1 claim .831 where the error may have variance 1.
+                   Equal tracks come back. O(K C S n^2) for S samples, of sources far apart few are effective.
+    References     N. Sharma et al., Harmonic Mean Density Fusion in Distributed Tracking: Performance and
+                   Comparison, eqs. (61)-(65), (67)-(73).
+    """
+    weights = average_weights(params.criterion, params.weights, tracks.mean.shape[:-2], tracks.count)
+    parts, rng = params.sources(tracks).normalised, seeded(tracks)
+    drawn = sample_mean_density(parts, weights, "geometric", rng, params.samples, params.inflation)
+    mixture = fit_mean_density(drawn, naive_product(parts, params))
+    if params.inflation == 1.0:
+        sole = params.weights.index(1.0) if 1.0 in params.weights else 0
+        mixture = chosen(all_same(parts) | (weights == 1.0).any(-1), nth(parts, sole), mixture)
+    info: dict[str, NDArray[Any]] = {"ess": drawn.ess / params.samples, "log_eta": drawn.log_eta}
+    fused = fused_tracks(mixture, weights, info)
+    return fused if tracks.mixture is not None else dataclasses.replace(fused, mixture=None)
+
+
+RULE = Rule(
+    key="geometric_mean_sampling",
+    title="Geometric mean density, sampled",
+    fuse=fuse,
+    params=GeometricMeanSamplingParams,
+    family="gaussian",
+    arity="n_ary",
+    guarantee="none",
+    caveat="Gaussian tracks: covariance intersection but for the sampling error",
+    source="Sharma (61)-(65), (67)-(73)",
+    cost="K S n^2 for S samples",
+    optional=("seed",),
+)

@@ -1,0 +1,64 @@
+"""Arithmetic average of Gaussian mixtures: the union of their components."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from track_fusion.densities.mixture_algebra import average
+from track_fusion.params import param
+from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
+from track_fusion.rules.mixture_common import ReductionParams, average_weights, fused_tracks
+
+
+@dataclasses.dataclass(frozen=True)
+class MixtureAverageParams(ReductionParams):
+    """The fusion weights and the number of components."""
+
+    criterion: str = param(
+        "uniform", "fusion weights: all equal (uniform), or given by 'weights'", choices=("uniform", "given")
+    )
+    weights: tuple[float, ...] = param(
+        (), "fusion weights for criterion given, one a source, sum 1", low=0.0, high=1.0, kind=float
+    )
+
+
+def fuse(tracks: SourceTracks, params: MixtureAverageParams) -> FusedTracks:
+    """Fuse K Gaussian mixtures by their arithmetic average: f = sum of w_i f_i.
+
+    Conservative if each track is: the weights do not depend on the means. Every mode of every source survives.
+
+    Parameters
+    ----------
+    tracks : SourceTracks    mixture (..., K, C), or Gaussian tracks; PHDs too: they are not normalised
+    params : MixtureAverageParams
+
+    Returns
+    -------
+    FusedTracks    mixture of K C components, or fewer by `max_components`; mean (..., n) and cov (..., n, n)
+                   are its moments, whatever its weights sum to; weights (..., K)
+
+    Raises
+    ------
+    ValueError     given weights do not fit, or a component has no covariance
+
+    Notes          Of PHDs the expected numbers of targets are averaged too. Reduction by merging keeps mean and
+                   covariance; cap does not. O(K C n^2), and (K C)^2 n^3 where components are merged.
+    References     T. Li et al., Second-order statistics analysis and comparison between arithmetic and
+                   geometric average fusion, 2019, eq. (9).
+    """
+    weights = average_weights(params.criterion, params.weights, tracks.mean.shape[:-2], tracks.count)
+    return fused_tracks(params.reduce(average(params.sources(tracks), weights)), weights)
+
+
+RULE = Rule(
+    key="mixture_average",
+    title="Average of mixtures",
+    fuse=fuse,
+    params=MixtureAverageParams,
+    family="mixture",
+    arity="n_ary",
+    guarantee="conservative",
+    caveat="of the merged moments, if every track is; not with reduction cap",
+    source="Li 2019 (9)",
+    cost="K C n^2 for C components a source, (K C)^2 n^3 to merge them",
+)

@@ -1,0 +1,202 @@
+"""What the rules on Gaussian mixtures share: reading the sources, keeping the number of components down."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from track_fusion.densities.mixture import Mixture, moments, same
+from track_fusion.densities.mixture_algebra import LogMixture, power, product
+from track_fusion.densities.mixture_reduction import REDUCTIONS, prune
+from track_fusion.linalg import Array, is_positive_definite
+from track_fusion.params import Params, param
+from track_fusion.rules.base import FusedTracks, SourceTracks, check_weights
+
+#: Components of less than this share are dropped before any merging: they only cost time.
+NEGLIGIBLE = 1e-12
+
+
+@dataclasses.dataclass(frozen=True)
+class ReductionParams(Params):
+    """How many components the mixtures may have before and after fusion, and how they get there."""
+
+    max_source_components: int = param(0, "most components of each source, reduced before fusion; 0: no limit", low=0)
+    max_components: int = param(
+        100, "most components of the fused mixture; after each source when several are folded; 0: no limit", low=0
+    )
+    reduction: str = param(
+        "runnalls",
+        "how to reduce components: merge by Runnalls' cost, by Salmond's distance, or cap: keep the heaviest",
+        choices=tuple(REDUCTIONS),
+    )
+
+    def reduce(self, mixture: Mixture) -> Mixture:
+        """Bring a fused mixture down to `max_components`."""
+        return self._reduced(mixture, self.max_components)
+
+    def sources(self, tracks: SourceTracks) -> Mixture:
+        """Return the tracks' densities, (..., K, C), brought down to `max_source_components`; see source_mixtures."""
+        return self._reduced(source_mixtures(tracks), self.max_source_components)
+
+    def _reduced(self, mixture: Mixture, count: int) -> Mixture:
+        if not 0 < count < mixture.count:
+            return mixture
+        return REDUCTIONS[self.reduction](prune(mixture, NEGLIGIBLE)[0], count)
+
+
+def source_mixtures(tracks: SourceTracks) -> Mixture:
+    """Return the tracks' densities as mixtures, weight (..., K, C); a Gaussian track has one component.
+
+    Weights are as given: those of an un-normalised mixture (PHD) sum to its expected number of targets.
+
+    Raises
+    ------
+    ValueError    a mixture has no weight, or a component no positive definite covariance (particles)
+    """
+    if tracks.mixture is None:
+        return Mixture(np.ones((*tracks.mean.shape[:-1], 1)), tracks.mean[..., None, :], tracks.cov[..., None, :, :])
+    total = tracks.mixture.weight.sum(-1)
+    if not (total > 0.0).all():
+        raise ValueError("The 'mixture.weight' of source tracks must not all be 0.")
+    if not is_positive_definite(tracks.mixture.cov).all():
+        raise ValueError(
+            "The 'mixture.cov' of source tracks must be positive definite: this rule does not take particles."
+        )
+    return tracks.mixture
+
+
+def nth(parts: Mixture, k: int) -> Mixture:
+    """Mixture (..., C) of the k-th of K sources (..., K, C)."""
+    return Mixture(parts.weight[..., k, :], parts.mean[..., k, :, :], parts.cov[..., k, :, :, :])
+
+
+def average_weights(criterion: str, weights: tuple[float, ...], batch: tuple[int, ...], count: int) -> Array:
+    """Fusion weights (..., K) by criterion uniform or given.
+
+    Raises
+    ------
+    ValueError    given weights do not fit, or are given for another criterion
+    """
+    if weights and criterion != "given":
+        raise ValueError(f"The 'weights' parameter needs criterion 'given'. Got criterion {criterion!r}.")
+    if criterion == "given":
+        return np.broadcast_to(check_weights(weights, count), (*batch, count))
+    return np.full((*batch, count), 1.0 / count)
+
+
+def fused_tracks(mixture: Mixture, weights: Array | None, info: Mapping[str, Any] | None = None) -> FusedTracks:
+    """Return the fused mixture with its merged moments."""
+    mean, cov = moments(mixture)
+    return FusedTracks(mean, cov, weights, mixture=mixture, info=info or {})
+
+
+def geometric_average(tracks: SourceTracks, weights: Array, params: ReductionParams) -> Mixture:
+    """Approximate geometric average of K mixtures, Li 2019 (49)-(51): powers of components, then their products.
+
+    Parameters
+    ----------
+    tracks : SourceTracks        K sources, each normalised first
+    weights : (..., K)           the same for all of the batch
+    params : ReductionParams
+
+    Returns
+    -------
+    Mixture    of weight 1
+    """
+    parts = params.sources(tracks).normalised
+    fused: Mixture | None = None
+    for k in range(tracks.count):
+        if weights.size and not weights[..., k].any():
+            continue  # a density to the power of 0 says nothing
+        raised = power(LogMixture.of(nth(parts, k)), weights[..., k])
+        if fused is None:
+            fused = raised.normalised
+        else:
+            fused = params.reduce(product(LogMixture.of(fused), raised).normalised)
+    assert fused is not None  # weights sum to 1
+    return fused
+
+
+def naive_product(parts: Mixture, params: ReductionParams) -> LogMixture:
+    """Product (..., M) of K mixtures (..., K, C), brought down to `max_components` after each source."""
+    fused = LogMixture.of(nth(parts, 0))
+    for k in range(1, parts.weight.shape[-2]):
+        both = product(fused, LogMixture.of(nth(parts, k)))
+        reduced = params.reduce(both.normalised)
+        fused = LogMixture.of(reduced) if reduced.count < both.mean.shape[-2] else both
+    return fused
+
+
+def all_same(parts: Mixture) -> NDArray[np.bool_]:
+    """Tell where all K mixtures (..., K, C) are equal, (...)."""
+    first = nth(parts, 0)
+    alike = np.ones(first.weight.shape[:-1], bool)
+    for k in range(1, parts.weight.shape[-2]):
+        alike &= same(first, nth(parts, k))
+    return alike
+
+
+# Folding rules for two mixtures over K sources.
+
+
+class Step(NamedTuple):
+    """Two mixtures fused: the mixture (..., C) of weight 1, the weight of the first (...), diagnostics (...)."""
+
+    mixture: Mixture
+    omega: Array | None
+    info: Mapping[str, NDArray[Any]]
+
+
+#: How a diagnostic of several steps becomes that of the whole; what is not named here must hold at every step.
+JOIN: dict[str, Callable[..., NDArray[Any]]] = {
+    "iterations": np.add,
+    "log_eta": np.add,
+    "ess": np.minimum,
+    "pruned": np.maximum,
+    "skipped": np.add,
+}
+
+
+def fold_mixtures(
+    tracks: SourceTracks,
+    params: ReductionParams,
+    step: Callable[[Mixture, Mixture, int], Step],
+    info: Mapping[str, float],
+) -> FusedTracks:
+    """Fuse mixtures 1 and 2, the result and mixture 3, and so on, reducing the components each time.
+
+    Parameters
+    ----------
+    tracks : SourceTracks    K sources
+    params : ReductionParams
+    step : callable          (fused so far (..., C1), next source (..., C2), its number k) -> Step
+    info                     the diagnostics and what they are for a single source
+
+    Returns
+    -------
+    FusedTracks    weights (..., K): the product of the weights along the way, None if the steps have none
+    """
+    parts = params.sources(tracks).normalised
+    lead = tracks.mean.shape[:-2]
+    fused, weights, weighed = nth(parts, 0), np.ones((*lead, 1)), True
+    found = {name: np.full(lead, value) for name, value in info.items()}
+    for k in range(1, tracks.count):
+        result = step(fused, nth(parts, k), k)
+        fused = params.reduce(result.mixture)
+        if result.omega is None:
+            weighed = False
+        else:
+            omega = result.omega[..., None]
+            weights = np.concatenate([weights * omega, 1.0 - omega], -1)
+        for name in found:
+            found[name] = JOIN.get(name, np.logical_and)(found[name], result.info[name])
+    return fused_tracks(fused, weights if weighed else None, found)
+
+
+def seeded(tracks: SourceTracks) -> np.random.Generator:
+    """Make the generator of a rule that samples, from extras["seed"]: an int or a Generator; 0 if absent."""
+    return np.random.default_rng(tracks.extras.get("seed", 0))
