@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
 
 Array = NDArray[np.float64]
 
@@ -165,3 +167,35 @@ def two_filters_and_intersection_looped(
 
 def _fused_trace(w: float, i1: Array, i2: Array) -> float:
     return float(np.trace(np.linalg.inv(w * i1 + (1 - w) * i2)))
+
+
+def mixture_log_pdf_loop(weight: Array, mean: Array, cov: Array, points: Array) -> Array:
+    """Log-density of a mixture: one scipy call a component."""
+    parts = zip(weight, mean, cov, strict=True)
+    return logsumexp([np.log(w) + multivariate_normal.logpdf(points, m, c) for w, m, c in parts], axis=0)
+
+
+def runnalls_loop(weight: Array, mean: Array, cov: Array, count: int) -> tuple[list[float], list[Array], list[Array]]:
+    """Merge the cheapest pair until `count` are left: the cost of every pair anew at every step."""
+    weights, means, covs = list(weight), list(mean), list(cov)
+
+    def merged(i: int, j: int) -> tuple[float, Array, Array]:
+        w, d = weights[i] + weights[j], means[i] - means[j]
+        m = (weights[i] * means[i] + weights[j] * means[j]) / w
+        p = (weights[i] * covs[i] + weights[j] * covs[j]) / w + weights[i] * weights[j] / w**2 * np.outer(d, d)
+        return w, m, p
+
+    def cost(i: int, j: int) -> float:
+        w, _, p = merged(i, j)
+        return 0.5 * float(
+            w * np.log(np.linalg.det(p))
+            - weights[i] * np.log(np.linalg.det(covs[i]))
+            - weights[j] * np.log(np.linalg.det(covs[j]))
+        )
+
+    while len(weights) > count:
+        pairs = ((i, j) for i in range(len(weights)) for j in range(i + 1, len(weights)))
+        i, j = min(pairs, key=lambda pair: cost(*pair))
+        weights[i], means[i], covs[i] = merged(i, j)
+        del weights[j], means[j], covs[j]
+    return weights, means, covs
