@@ -27,12 +27,14 @@ ROS_WHEELS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
 CLI = ["click>=8.1", "rich>=13"]
 BAGS = ["rosbags>=0.10"]
 REPORT = ["matplotlib>=3.6"]
+SCENARIOS = ["pymap3d>=3"]
 TEST = [
     "pytest>=7.4",
     "hypothesis>=6.90",
     "mpmath>=1.2",
     "pyriemann>=0.9,<0.12",  # 0.12 asks for NumPy 1.25 but needs 2
     "pyyaml>=6",
+    *SCENARIOS,
     "cyclonedds>=0.10.5; platform_machine == 'x86_64'",
 ]
 DEV = [
@@ -67,7 +69,8 @@ setup(
         "cli": CLI,
         "bags": BAGS,
         "report": REPORT,
-        "all": CLI + BAGS + REPORT,
+        "scenarios": SCENARIOS,
+        "all": CLI + BAGS + REPORT + SCENARIOS,
         "test": TEST,
         "dev": TEST + DEV,
     },

@@ -42,6 +42,59 @@ def covariance_intersection_slsqp(means: Array, covs: Array) -> tuple[Array, Arr
     return p @ sum(wi * i @ x for wi, i, x in zip(result.x, infos, means, strict=True)), p
 
 
+def inverse_covariance_intersection_minimize_scalar(x1: Array, p1: Array, x2: Array, p2: Array) -> tuple[Array, Array]:
+    """Fuse one pair by ICI: one bounded minimize_scalar over a function with np.linalg.inv."""
+    i1, i2 = np.linalg.inv(p1), np.linalg.inv(p2)
+
+    def cost(w: float) -> float:
+        return float(np.linalg.det(np.linalg.inv(i1 + i2 - np.linalg.inv(w * p1 + (1 - w) * p2))))
+
+    w = minimize_scalar(cost, bounds=(0, 1), method="bounded").x
+    common = np.linalg.inv(w * p1 + (1 - w) * p2)
+    p = np.linalg.inv(i1 + i2 - common)
+    return p @ (i1 @ x1 + i2 @ x2 - common @ (w * x1 + (1 - w) * x2)), p
+
+
+def harmonic_mean_minimize_scalar(x1: Array, p1: Array, x2: Array, p2: Array) -> tuple[Array, Array]:
+    """Fuse one pair by HMD-GA at the weight (77): one bounded minimize_scalar over a function with np.linalg.inv."""
+    i1, i2, spread = np.linalg.inv(p1), np.linalg.inv(p2), np.outer(x1 - x2, x1 - x2)
+
+    def common(w: float) -> Array:
+        return np.linalg.inv((1 - w) * p1 + w * p2 + w * (1 - w) * spread)
+
+    w = minimize_scalar(lambda w: np.linalg.det(common(w)), bounds=(0, 1), method="bounded").x
+    info = common(w)
+    p = np.linalg.inv(i1 + i2 - info)
+    return p @ (i1 @ x1 + i2 @ x2 - info @ ((1 - w) * x1 + w * x2)), p
+
+
+def covariance_union_slsqp(means: Array, covs: Array, free: bool) -> tuple[Array, Array]:
+    """Bound K tracks: one SLSQP over the Cholesky factor, with the lowest eigenvalue of each slack as a constraint."""
+    n, low = means.shape[1], np.tril_indices(means.shape[1])
+    size, centre = len(low[0]), means.mean(0)
+
+    def parts(v: Array) -> tuple[Array, Array]:
+        root = np.zeros((n, n))
+        root[low] = v[:size]
+        return root @ root.T, (v[size:] if free else centre)
+
+    def slack(v: Array) -> Array:
+        p, x = parts(v)
+        return np.array(
+            [np.linalg.eigvalsh(p - c - np.outer(x - m, x - m))[0] for m, c in zip(means, covs, strict=True)]
+        )
+
+    start = np.linalg.cholesky(sum(c + np.outer(centre - m, centre - m) for m, c in zip(means, covs, strict=True)))[low]
+    result = minimize(
+        lambda v: np.log(np.linalg.det(parts(v)[0])),
+        np.concatenate([start, centre]) if free else start,
+        method="SLSQP",
+        constraints={"type": "ineq", "fun": slack},
+    )
+    p, x = parts(result.x)
+    return x, p
+
+
 def lapack_floor(p1: Array, p2: Array) -> tuple[Array, Array, Array]:
     """One batched Cholesky, eigh and inverse of the arrays of a batch of pairs: what no kernel can do without."""
     return np.linalg.cholesky(p1 + p2), np.linalg.eigh(p1)[0], np.linalg.inv(p2)

@@ -56,6 +56,16 @@ def whitener(cov: Array) -> Array:
     return np.asarray(np.linalg.inv(cholesky(cov)), np.float64)
 
 
+def solve(a: Array, b: Array) -> Array:
+    """Return A^-1 B, (..., n, n), (..., n, k) -> (..., n, k).
+
+    Raises
+    ------
+    LinAlgError    a matrix is singular
+    """
+    return np.asarray(np.linalg.solve(a, b), np.float64)
+
+
 def logdet(cov: Array) -> Array:
     """Log-determinant of positive definite matrices, (..., n, n) -> (...)."""
     diagonal = np.diagonal(np.linalg.cholesky(cov), axis1=-2, axis2=-1)

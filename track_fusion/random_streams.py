@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable, Sequence
 
 import numpy as np
+
+from track_fusion.linalg import Array
 
 
 def stream(seed: int, run: int, role: str) -> np.random.Generator:
@@ -13,3 +16,43 @@ def stream(seed: int, run: int, role: str) -> np.random.Generator:
     Draw from it step by step: n draws of one step after another equal one draw of all steps.
     """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(run, zlib.crc32(role.encode()))))
+
+
+#: One generator for a single run, or one for each run of a batch, whose first leading axis counts the runs.
+Generators = np.random.Generator | Sequence[np.random.Generator]
+
+
+Draw = Callable[[np.random.Generator, tuple[int, ...]], Array]
+
+
+def _drawn(
+    rng: Generators, shape: tuple[int, ...], draw: Callable[[np.random.Generator, tuple[int, ...]], Array]
+) -> Array:
+    if isinstance(rng, np.random.Generator):
+        return draw(rng, shape)
+    if not shape or len(rng) != shape[0]:
+        raise ValueError(f"There must be one generator for each of the runs, shape {shape[:1]}. Got {len(rng)}.")
+    drawn = np.empty(shape)
+    for row, one in zip(drawn, rng, strict=True):
+        row[...] = draw(one, shape[1:])
+    return drawn
+
+
+def normals(rng: Generators, shape: tuple[int, ...]) -> Array:
+    """Draw standard normals; with a sequence of generators each draws its own run, `shape[1:]`.
+
+    Raises
+    ------
+    ValueError    not one generator for each run
+    """
+    return _drawn(rng, shape, lambda one, size: one.standard_normal(size))
+
+
+def uniforms(rng: Generators, shape: tuple[int, ...]) -> Array:
+    """Draw from [0, 1), as :func:`normals`."""
+    return _drawn(rng, shape, lambda one, size: np.asarray(one.random(size)))
+
+
+def exponentials(rng: Generators, shape: tuple[int, ...]) -> Array:
+    """Draw standard exponentials, as :func:`normals`."""
+    return _drawn(rng, shape, lambda one, size: one.standard_exponential(size))

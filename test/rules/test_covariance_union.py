@@ -173,9 +173,9 @@ def test_the_optimal_mean_of_two_against_nelder_mead(criterion: str, distance: f
 def _certificate(x: Array, p: Array, mean: Array, cov: Array, criterion: str, free: bool) -> tuple[float, float]:
     """Look for multipliers that prove the bound (mean, cov) smallest; return their residual and lowest eigenvalue.
 
-    With Z_i positive semi-definite, on the directions in which track i touches the bound: sum of Z_i = the gradient of the
-    criterion (one for log det, L' L for the trace, where the bound L L' is whitened), and, if the mean is
-    free, the sum of their borders = 0. The problem is convex, so that this suffices.
+    With Z_i positive semi-definite, on the directions in which track i touches the bound: sum of Z_i = the gradient of
+    the criterion (one for log det, L' L for the trace, where the bound L L' is whitened), and, if the mean
+    is free, the sum of their borders = 0. The problem is convex, so that this suffices.
     """
     lower, n = np.linalg.cholesky(cov), len(mean)
     white = np.linalg.inv(lower)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.linalg import Array
+from track_fusion.models.base import Transition
 from track_fusion.params import Params, param
 from track_fusion.tracks import StateLayout
 
@@ -88,3 +89,7 @@ class NearlyConstantVelocity:
                 second[v] = np.sqrt(noise[v, v] - first[v] ** 2)
                 columns.append(second)
         return np.stack(columns, 1)
+
+    def over(self, dt: float) -> Transition:
+        """Return the motion over dt seconds."""
+        return Transition.linear(*self.matrices(dt), self.noise_factor(dt))

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from track_fusion.params import unknown_name_error
-from track_fusion.scenarios import li2022_linear
+from track_fusion.scenarios import li2022_linear, li2022_nonlinear
 from track_fusion.scenarios.base import RuleChoice, Scenario, Tracking, figures
 
-SCENARIOS: dict[str, Scenario] = {module.SCENARIO.key: module.SCENARIO for module in (li2022_linear,)}
+SCENARIOS: dict[str, Scenario] = {module.SCENARIO.key: module.SCENARIO for module in (li2022_linear, li2022_nonlinear)}
 
 
 def get_scenario(key: str) -> Scenario:

@@ -11,8 +11,7 @@ import numpy as np
 
 from track_fusion.linalg import Array, matvec, transpose
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.models.measurement import LinearSensor
-from track_fusion.models.motion import NearlyConstantVelocity
+from track_fusion.models.base import Motion, Sensor
 from track_fusion.params import Params
 from track_fusion.random_streams import stream
 from track_fusion.rules import Rule, SourceTracks
@@ -27,18 +26,18 @@ class Tracking:
 
     Attributes
     ----------
-    motion : NearlyConstantVelocity    of the truth and of the filters; its layout is the scenario's
+    motion : Motion    of the truth and of the filters; its layout is the scenario's
     dt_s, steps                        sampling interval in seconds, number of filtering steps
     initial_mean (n,), initial_cov (n, n)    of every filter
-    sensors : mapping name -> LinearSensor
+    sensors : mapping name -> Sensor
     """
 
-    motion: NearlyConstantVelocity
+    motion: Motion
     dt_s: float
     steps: int
     initial_mean: Array
     initial_cov: Array
-    sensors: Mapping[str, LinearSensor]
+    sensors: Mapping[str, Sensor]
 
     def truth(self, seed: int, run: int, steps: int | None = None) -> Array:
         """Draw the target's states at steps 0 to T, (T + 1, n); step 0 is the initial mean itself.
@@ -51,12 +50,14 @@ class Tracking:
     def truths(self, seed: int, runs: Sequence[int], steps: int | None = None) -> Array:
         """Draw the target's states of several runs, (R, T + 1, n)."""
         steps = self.steps if steps is None else steps
-        transition, factor = self.motion.matrices(self.dt_s)[0], self.motion.noise_factor(self.dt_s)
+        transition = self.motion.over(self.dt_s)
+        factor = transition.noise_factor
         draws = np.stack([stream(seed, run, "truth").standard_normal((steps, factor.shape[1])) for run in runs])
         states = np.empty((len(runs), steps + 1, len(self.initial_mean)))
         states[:, 0] = self.initial_mean
         for k in range(steps):
-            states[:, k + 1] = matvec(transition, states[:, k]) + matvec(factor, draws[:, k])
+            # One matrix a run: products of larger ones round differently with the number of runs.
+            states[:, k + 1] = transition.advance(states[:, k, None])[:, 0] + matvec(factor, draws[:, k])
         return states
 
     def measurements(self, truth: Array, seed: int, run: int) -> dict[str, Array]:
@@ -65,7 +66,8 @@ class Tracking:
         for name, sensor in self.sensors.items():
             factor = np.linalg.cholesky(sensor.noise)
             draws = stream(seed, run, name).standard_normal((len(truth) - 1, len(factor)))
-            found[name] = truth[1:] @ sensor.matrix.T + draws @ factor.T
+            z = sensor.observe(truth[1:]) + draws @ factor.T
+            found[name] = sensor.residual(z, np.zeros_like(z))  # angles wrapped
         return found
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.naive import NaiveParams
 from track_fusion.scenarios.base import RuleChoice, Scenario, Tracking, fuse_runs
+from track_fusion.scenarios.one_target import Quantity, Row, Sir, sir_alone, sir_fused
+from track_fusion.scenarios.one_target import squared_errors as collect
 from track_fusion.tracks import planar_layout
 
 #: Table I: ARMSE of position (m) and velocity (m/s).
@@ -25,8 +27,15 @@ TABLE_1 = {
     "kf-naive": (39.99, 13.32),
     "kf-arithmetic_average": (18.57, 10.91),
     "kf-covariance_intersection": (18.85, 10.70),
+    "sir-alone": (22.90, 11.74),
+    "sir-ic": (20.62, 11.36),
+    "sir-naive": (66.07, 16.16),
+    "sir-arithmetic_average": (19.55, 11.30),
+    "sir-covariance_intersection": (20.76, 11.23),
 }
-QUANTITIES = ("position_armse_m", "velocity_armse_mps")
+LAYOUT = planar_layout()
+QUANTITIES = {"position_armse_m": Quantity(LAYOUT.position), "velocity_armse_mps": Quantity(LAYOUT.velocity)}
+SIR = Sir(200)
 
 RULE_CHOICES = (
     RuleChoice("naive", NaiveParams()),
@@ -36,20 +45,16 @@ RULE_CHOICES = (
 )
 
 
-def _tracking() -> Tracking:
-    layout = planar_layout()
-    motion = NearlyConstantVelocity(layout, MotionParams(noise_form="piecewise_constant", process_noise=5.0))
-    return Tracking(
-        motion=motion,
-        dt_s=1.0,
-        steps=100,
-        initial_mean=np.array([1000.0, 1000.0, 20.0, 0.0]),
-        initial_cov=np.diag([500.0, 500.0, 50.0, 50.0]),
-        sensors={"sensor_1": LinearSensor.position(layout, 20.0), "sensor_2": LinearSensor.position(layout, 40.0)},
-    )
-
-
-TRACKING = _tracking()
+MOTION = NearlyConstantVelocity(LAYOUT, MotionParams(noise_form="piecewise_constant", process_noise=5.0))
+SENSORS = {"sensor_1": LinearSensor.position(LAYOUT, 20.0), "sensor_2": LinearSensor.position(LAYOUT, 40.0)}
+TRACKING = Tracking(
+    motion=MOTION,
+    dt_s=1.0,
+    steps=100,
+    initial_mean=np.array([1000.0, 1000.0, 20.0, 0.0]),
+    initial_cov=np.diag([500.0, 500.0, 50.0, 50.0]),
+    sensors=SENSORS,
+)
 
 
 def study(runs: int, seed: int, progress: Callable[[float], None]) -> dict[str, Estimate]:
@@ -59,26 +64,39 @@ def study(runs: int, seed: int, progress: Callable[[float], None]) -> dict[str, 
     -------
     {figure name: Estimate}, names like kf-alone/position_armse_m
     """
-    return {name: armse(squares) for name, squares in squared_errors(range(runs), seed, progress).items()}
+    errors = squared_errors(range(runs), seed, progress, kalman_rows() | particle_rows())
+    return {name: armse(squares) for name, squares in errors.items()}
 
 
-def squared_errors(runs: Sequence[int], seed: int, progress: Callable[[float], None]) -> dict[str, Array]:
-    """Run every row of Table I over these Monte Carlo runs: {figure name: squared norm of the error (R, T)}."""
-    truth = TRACKING.truths(seed, runs)
-    drawn = [TRACKING.measurements(states, seed, run) for states, run in zip(truth, runs, strict=True)]
-    seen = [np.stack([d[name] for d in drawn]) for name in TRACKING.sensors]
-    rows = {"kf-alone": one_filter(seen[:1]), "kf-ic": one_filter(seen)}
-    rows |= {f"kf-{choice.name}": fused_filters(choice, seen) for choice in RULE_CHOICES}
-    squares: dict[str, Array] = {}
-    for done, (row, estimates) in enumerate(rows.items()):
-        names = [f"{row}/{quantity}" for quantity in QUANTITIES]
-        squares |= {name: np.empty((len(runs), TRACKING.steps)) for name in names}
-        for k, mean in enumerate(estimates):
-            squared = (mean - truth[:, k + 1]) ** 2
-            for name, part in zip(names, (squared[:, :2], squared[:, 2:]), strict=True):
-                squares[name][:, k] = part.sum(1)
-            progress((done + (k + 1) / TRACKING.steps) / len(rows))
-    return squares
+def squared_errors(
+    runs: Sequence[int], seed: int, progress: Callable[[float], None], rows: Mapping[str, Row] | None = None
+) -> dict[str, Array]:
+    """Run rows of Table I, by default the Kalman filters', over these Monte Carlo runs.
+
+    Returns
+    -------
+    {figure name: squared norm of the error (R, T)}
+    """
+    return collect(TRACKING, kalman_rows() if rows is None else rows, QUANTITIES, runs, seed, progress)
+
+
+def kalman_rows() -> dict[str, Row]:
+    """Rows of Table I by Kalman filters."""
+    table = {"kf-alone": Row(lambda s: one_filter(s.seen[:1])), "kf-ic": Row(lambda s: one_filter(s.seen))}
+    for choice in RULE_CHOICES:
+        table[f"kf-{choice.name}"] = Row(lambda s, choice=choice: fused_filters(choice, s.seen))  # type: ignore[misc]
+    return table
+
+
+def particle_rows() -> dict[str, Row]:
+    """Rows of Table I by particle filters."""
+    table = {"sir-alone": sir_alone(TRACKING, SIR, 1), "sir-ic": sir_alone(TRACKING, SIR, 2)}
+    for choice in RULE_CHOICES:
+        averaged = choice.key == "arithmetic_average"
+        table[f"sir-{choice.name}"] = sir_fused(TRACKING, SIR, choice, union=averaged)
+        if averaged:
+            table[f"sir-{choice.name}@gaussian"] = sir_fused(TRACKING, SIR, choice)
+    return table
 
 
 def _start(runs: int) -> tuple[Array, Array]:
@@ -86,23 +104,23 @@ def _start(runs: int) -> tuple[Array, Array]:
     return np.tile(TRACKING.initial_mean, (runs, 1)), TRACKING.initial_cov[None]
 
 
-def one_filter(seen: list[Array]) -> Iterator[Array]:
+def one_filter(seen: Sequence[Array]) -> Iterator[Array]:
     """One filter that uses the measurements of the given sensors, (R, T, m) each, jointly."""
-    sensors = list(TRACKING.sensors.values())[: len(seen)]
+    sensors = list(SENSORS.values())[: len(seen)]
     mean, cov = _start(len(seen[0]))
     for k in range(TRACKING.steps):
-        mean, cov = predict(mean, cov, *TRACKING.motion.matrices(TRACKING.dt_s))
+        mean, cov = predict(mean, cov, *MOTION.matrices(TRACKING.dt_s))
         z = [s[:, k] for s in seen]
         mean, cov, _ = update_joint(mean, cov, z, [s.matrix for s in sensors], [s.noise for s in sensors])
         yield mean
 
 
-def fused_filters(choice: RuleChoice, seen: list[Array]) -> Iterator[Array]:
+def fused_filters(choice: RuleChoice, seen: Sequence[Array]) -> Iterator[Array]:
     """One filter a sensor, fused after each step, the fused posterior fed back to all of them."""
-    rule, sensors = RULES[choice.key], list(TRACKING.sensors.values())
+    rule, sensors = RULES[choice.key], list(SENSORS.values())
     mean, cov = _start(len(seen[0]))
     for k in range(TRACKING.steps):
-        mean, cov = predict(mean, cov, *TRACKING.motion.matrices(TRACKING.dt_s))
+        mean, cov = predict(mean, cov, *MOTION.matrices(TRACKING.dt_s))
         local = [update(mean, cov, z[:, k], s.matrix, s.noise)[:2] for z, s in zip(seen, sensors, strict=True)]
         means, covs = (np.stack(parts, 1) for parts in zip(*local, strict=True))
         mean, cov = fuse_runs(rule, choice.params, means, covs)
@@ -121,6 +139,9 @@ SCENARIO = Scenario(
         "the fused posterior is fed back to both filters at every step",
         "the truth starts exactly at the initial mean, the filters at the initial mean and covariance",
         "error: 2-norm, root-mean-square over runs at each step, averaged over the 100 steps",
+        "SIR: systematic resampling after every step; estimates before it; each filter draws again from the fused "
+        "density by itself (arithmetic average: from the union of the weighted particles, @gaussian: after conversion)",
+        "particles turned into a Gaussian: 1e-9 of the initial variances is added",
     ),
     study=study,
     tracking=TRACKING,

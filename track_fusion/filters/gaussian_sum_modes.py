@@ -1,0 +1,135 @@
+"""The interacting multiple model filter with a Gaussian sum in each mode: for states far from Gaussian."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from track_fusion.densities.gaussian import merge
+from track_fusion.filters import extended
+from track_fusion.filters.interacting_multiple_model import check_chain, mixing, reweighted
+from track_fusion.filters.iterated_corrector import GaussianUpdate
+from track_fusion.linalg import Array
+from track_fusion.models.base import Sensor, Transition
+from track_fusion.rules.base import Mixture
+
+#: (mixture (..., C), count) -> mixture of at most `count` components, as runnalls of densities/mixture_reduction.py
+Reduce = Callable[[Mixture, int], Mixture]
+
+
+@dataclasses.dataclass(frozen=True)
+class MixtureModes:
+    """A Gaussian mixture of C components for each of M modes.
+
+    Attributes
+    ----------
+    probability : (..., M)    sum one
+    mixture : Mixture         weight (..., M, C), sum one in each mode, mean (..., M, C, n), cov (..., M, C, n, n)
+    """
+
+    probability: Array
+    mixture: Mixture
+
+    @property
+    def marginal(self) -> Mixture:
+        """The mixture of all modes, M C components."""
+        (*lead, modes, count), n = self.mixture.weight.shape, self.mixture.mean.shape[-1]
+        return Mixture(
+            (self.probability[..., None] * self.mixture.weight).reshape(*lead, modes * count),
+            self.mixture.mean.reshape(*lead, modes * count, n),
+            self.mixture.cov.reshape(*lead, modes * count, n, n),
+        )
+
+    @property
+    def moments(self) -> tuple[Array, Array]:
+        """Mean (..., n) and covariance (..., n, n) over all modes and components."""
+        whole = self.marginal
+        return merge(whole.mean, whole.cov, whole.weight)
+
+
+def mix(modes: MixtureModes, chain: Array) -> MixtureModes:
+    """Let the modes jump: each new mode's mixture holds the components of all old ones, M C of them.
+
+    Parameters
+    ----------
+    modes : MixtureModes    (..., M)
+    chain : (M, M)          chain[i, j] = probability of going from mode i to mode j
+
+    Raises
+    ------
+    ValueError    the chain is malformed
+    """
+    part, count = modes.mixture, modes.probability.shape[-1]
+    check_chain(chain, count)
+    (*lead, _, size), n = part.weight.shape, part.mean.shape[-1]
+    following, share = mixing(modes.probability, chain)
+    weight = (share[..., None] * part.weight[..., None, :, :]).reshape(*lead, count, count * size)
+    mean = np.broadcast_to(part.mean.reshape(*lead, 1, count * size, n), (*weight.shape, n))
+    cov = np.broadcast_to(part.cov.reshape(*lead, 1, count * size, n, n), (*weight.shape, n, n))
+    return MixtureModes(following, Mixture(weight, mean, cov))
+
+
+def predict(
+    modes: MixtureModes,
+    transitions: Sequence[Transition],
+    chain: Array,
+    reduce: Reduce,
+    count: int,
+    jump_first: bool = False,
+) -> MixtureModes:
+    """Predict one interval by extended Kalman filters, then reduce each mode to at most `count` components.
+
+    Parameters
+    ----------
+    modes : MixtureModes           (..., M)
+    transitions : M Transitions    one a mode
+    chain : (M, M)                 chain[i, j] = probability of going from mode i to mode j
+    reduce : Reduce                Runnalls in Ahmed
+    count : int                    components to keep in each mode
+    jump_first : bool              false: move by the old mode, then jump (Ahmed (57), (73)); true: jump, then move
+
+    Notes         Exact, but for the linearisation, as long as nothing is reduced: C grows M-fold at each step.
+    References    Ahmed (70)-(73) and 5.4.2.
+    """
+    modes = mix(modes, chain) if jump_first else modes
+    part = modes.mixture
+    moved = [
+        extended.predict(part.mean[..., i, :, :], part.cov[..., i, :, :, :], transition)
+        for i, transition in enumerate(transitions)
+    ]
+    mean, cov = np.stack([m for m, _ in moved], -3), np.stack([c for _, c in moved], -4)
+    modes = MixtureModes(modes.probability, Mixture(part.weight, mean, cov))
+    return _reduced(modes if jump_first else mix(modes, chain), reduce, count)
+
+
+def _reduced(modes: MixtureModes, reduce: Reduce, count: int) -> MixtureModes:
+    if modes.mixture.weight.shape[-1] <= count:
+        return modes
+    return MixtureModes(modes.probability, reduce(modes.mixture, count))
+
+
+def update(
+    modes: MixtureModes, z: Array, sensor: Sensor, one: GaussianUpdate = extended.update
+) -> tuple[MixtureModes, Array]:
+    """Condition every component on z = h(x) + v; components and modes are weighed by their likelihoods.
+
+    Parameters
+    ----------
+    modes : MixtureModes     (..., M)
+    z : (..., m)
+    sensor : Sensor
+    one : GaussianUpdate     the filter of a component
+
+    Returns
+    -------
+    MixtureModes, log-likelihood of z over all modes (...)
+
+    References    Ahmed (67)-(69).
+    """
+    part = modes.mixture
+    mean, cov, innovation = one(part.mean, part.cov, z[..., None, None, :], sensor)
+    weight, mode_likelihood = reweighted(part.weight, innovation.log_likelihood)
+    probability, total = reweighted(modes.probability, mode_likelihood)
+    return MixtureModes(probability, Mixture(weight, mean, cov)), total

@@ -1,0 +1,141 @@
+"""The interacting multiple model filter (IMM): a target that jumps between any number of motions."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from track_fusion.densities.gaussian import merge
+from track_fusion.filters import extended
+from track_fusion.filters.iterated_corrector import GaussianUpdate
+from track_fusion.linalg import Array
+from track_fusion.models.base import Sensor, Transition
+
+
+@dataclasses.dataclass(frozen=True)
+class Modes:
+    """A Gaussian for each of M modes.
+
+    Attributes
+    ----------
+    probability : (..., M)    sum one
+    mean : (..., M, n)
+    cov : (..., M, n, n)
+    """
+
+    probability: Array
+    mean: Array
+    cov: Array
+
+    @classmethod
+    def start(cls, probability: Array, mean: Array, cov: Array) -> Modes:
+        """Give every mode the same Gaussian, mean (..., n), cov (..., n, n); probability (M,) or (..., M)."""
+        count, lead = probability.shape[-1], mean.shape[:-1]
+        return cls(
+            np.broadcast_to(probability, (*lead, count)).copy(),
+            np.repeat(mean[..., None, :], count, -2),
+            np.repeat(cov[..., None, :, :], count, -3),
+        )
+
+    @property
+    def moments(self) -> tuple[Array, Array]:
+        """Mean (..., n) and covariance (..., n, n) over all modes."""
+        return merge(self.mean, self.cov, self.probability)
+
+
+def check_chain(chain: Array, count: int) -> None:
+    """Check a Markov chain's matrix.
+
+    Raises
+    ------
+    ValueError    it is not (M, M), has a negative entry, or a row that does not sum to one
+    """
+    if chain.shape != (count, count):
+        raise ValueError(f"The 'chain' of {count} modes must have shape {(count, count)}. Got {chain.shape}.")
+    if (chain < 0).any() or (np.abs(chain.sum(-1) - 1.0) > 1e-9).any():
+        raise ValueError(f"The rows of 'chain' must be non-negative and sum to 1. Got sums {chain.sum(-1)}.")
+
+
+def mixing(probability: Array, chain: Array) -> tuple[Array, Array]:
+    """Return the next modes' probabilities (..., M) and the share (..., j, i) of old mode i in new mode j."""
+    joint = np.swapaxes(probability[..., :, None] * chain, -1, -2)
+    following = joint.sum(-1)
+    empty = following == 0.0
+    share = np.where(empty[..., None], probability[..., None, :], joint / np.where(empty, 1.0, following)[..., None])
+    return following, share
+
+
+def mix(modes: Modes, chain: Array) -> Modes:
+    """Let the modes jump: each new mode's Gaussian has the moments of the mixture of old ones that lead to it.
+
+    Parameters
+    ----------
+    modes : Modes      (..., M)
+    chain : (M, M)     chain[i, j] = probability of going from mode i to mode j
+    """
+    count = modes.probability.shape[-1]
+    check_chain(chain, count)
+    following, share = mixing(modes.probability, chain)
+    mean = np.broadcast_to(modes.mean[..., None, :, :], (*share.shape, modes.mean.shape[-1]))
+    cov = np.broadcast_to(modes.cov[..., None, :, :, :], (*mean.shape, modes.mean.shape[-1]))
+    return Modes(following, *merge(mean, cov, share))
+
+
+def predict(modes: Modes, transitions: Sequence[Transition], chain: Array, jump_first: bool = True) -> Modes:
+    """Predict one interval.
+
+    Parameters
+    ----------
+    modes : Modes                  (..., M)
+    transitions : M Transitions    one a mode
+    chain : (M, M)                 chain[i, j] = probability of going from mode i to mode j
+    jump_first : bool              true: the mode jumps, then the target moves by the new one (Blom and Bar-Shalom);
+                                   false: it moves by the old mode, then jumps (Ahmed (57), (73))
+
+    Raises
+    ------
+    ValueError    the chain is malformed
+
+    References    H. A. P. Blom, Y. Bar-Shalom, The interacting multiple model algorithm, 1988; Ahmed (70)-(73),
+                  where (71) is the probability of m_k and (73) must be divided by P(m_(k+1)).
+    """
+    modes = mix(modes, chain) if jump_first else modes
+    moved = [
+        extended.predict(modes.mean[..., i, :], modes.cov[..., i, :, :], transition)
+        for i, transition in enumerate(transitions)
+    ]
+    modes = Modes(modes.probability, np.stack([m for m, _ in moved], -2), np.stack([c for _, c in moved], -3))
+    return modes if jump_first else mix(modes, chain)
+
+
+def update(modes: Modes, z: Array, sensor: Sensor, one: GaussianUpdate = extended.update) -> tuple[Modes, Array]:
+    """Condition every mode on z = h(x) + v, and weigh it by its likelihood.
+
+    Parameters
+    ----------
+    modes : Modes            (..., M)
+    z : (..., m)
+    sensor : Sensor
+    one : GaussianUpdate     the filter within a mode
+
+    Returns
+    -------
+    Modes, log-likelihood of z over all modes (...)
+
+    References    Ahmed (67)-(69).
+    """
+    mean, cov, innovation = one(modes.mean, modes.cov, z[..., None, :], sensor)
+    probability, total = reweighted(modes.probability, innovation.log_likelihood)
+    return Modes(probability, mean, cov), total
+
+
+def reweighted(weight: Array, log_likelihood: Array) -> tuple[Array, Array]:
+    """Multiply weights (..., M) by likelihoods: the new weights, sum one, and the log of what they summed to."""
+    with np.errstate(divide="ignore"):
+        joint = np.log(weight) + log_likelihood
+    top = joint.max(-1, keepdims=True)
+    scaled = np.exp(joint - top)
+    total = scaled.sum(-1, keepdims=True)
+    return scaled / total, np.asarray((np.log(total) + top)[..., 0])

@@ -1,0 +1,203 @@
+"""A radar's own tracker: any number of targets in clutter, by probabilistic data association with existence.
+
+Tracks start from pairs of detections in successive scans that no track claims, are confirmed and deleted by their
+probability of existence, and merged when they have become one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from track_fusion.association.gate import gate
+from track_fusion.chi_square import chi_square_quantile
+from track_fusion.filters import extended
+from track_fusion.filters.probabilistic_data_association import (
+    ClutterParams,
+    predict_existence,
+    update,
+    update_existence,
+)
+from track_fusion.linalg import Array
+from track_fusion.models.base import Motion
+from track_fusion.models.measurement import RangeBearingSensor
+from track_fusion.params import param
+from track_fusion.tracks import CONFIRMED, TrackBatch
+
+SECOND_NS = 1_000_000_000
+#: Candidates are searched in Cartesian coordinates, in a gate so much wider than the exact one in range and bearing.
+SEARCH_MARGIN = 2.0
+#: A detection counts as claimed when it is a track's with at least this probability.
+CLAIMED = 0.1
+
+Indices = NDArray[np.intp]
+
+
+@dataclasses.dataclass(frozen=True)
+class PdaTrackerParams(ClutterParams):
+    """When tracks begin, count and end."""
+
+    birth_existence: float = param(0.1, "existence probability of a track begun from two detections", low=0.0, high=1.0)
+    confirmation_existence: float = param(0.99, "a track counts from this probability on", low=0.0, high=1.0)
+    deletion_existence: float = param(0.01, "a track ends below this probability", low=0.0, high=1.0)
+    speed_sd: float = param(150.0, "standard deviation of each axis of an unknown velocity", unit="m/s", low=0.0,
+                            strict=True)  # fmt: skip
+    merge_probability: float = param(
+        0.5, "two tracks are one when their distance lies within this quantile of chi-square", low=0.0, high=1.0
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class PdaTracks:
+    """What a tracker carries from scan to scan.
+
+    Attributes
+    ----------
+    mean, cov : (N, n), (N, n, n)
+    existence : (N,)             probability that there is a target
+    confirmed : (N,) bool        once true, until deletion
+    track_id : (N,)              ascending
+    leftover : (D, m)            detections of the last scan that no track claimed
+    next_id : int
+    """
+
+    mean: Array
+    cov: Array
+    existence: Array
+    confirmed: NDArray[np.bool_]
+    track_id: NDArray[np.int64]
+    leftover: Array
+    next_id: int
+
+    @classmethod
+    def none(cls, axes: int, measured: int) -> PdaTracks:
+        """No tracks, of `axes` axes, and no detections of `measured`."""
+        empty = np.zeros((0, axes))
+        ids, flags = np.zeros(0, np.int64), np.zeros(0, bool)
+        return cls(empty, np.zeros((0, axes, axes)), np.zeros(0), flags, ids, np.zeros((0, measured)), 1)
+
+    def __getitem__(self, key: Indices | NDArray[np.bool_]) -> PdaTracks:
+        """Return some of the tracks."""
+        names = ("mean", "cov", "existence", "confirmed", "track_id")
+        return dataclasses.replace(self, **{name: getattr(self, name)[key] for name in names})
+
+
+class PdaTracker:
+    """Tracks every target that one range-bearing sensor sees.
+
+    Parameters
+    ----------
+    motion : Motion                 its layout is the tracker's
+    sensor : RangeBearingSensor     of that layout
+    frame_id : str
+    params : PdaTrackerParams
+
+    References     Sharma 6.4 (PDA); D. Musicki et al. 1994 (existence).
+    """
+
+    def __init__(self, motion: Motion, sensor: RangeBearingSensor, frame_id: str, params: PdaTrackerParams) -> None:
+        self.motion, self.sensor, self.frame_id, self.params = motion, sensor, frame_id, params
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all."""
+        self.tracks = PdaTracks.none(self.motion.layout.size, len(self.sensor.noise))
+        self.time_ns = -1
+
+    def step(self, time_ns: int, values: Array) -> TrackBatch:
+        """Predict to a scan and update with it.
+
+        Parameters
+        ----------
+        time_ns : int      not before the last one
+        values : (D, 2)    range and bearing of all detections; none is a scan too
+
+        Returns
+        -------
+        TrackBatch    the confirmed tracks
+        """
+        dt_s = 0.0 if self.time_ns < 0 else (time_ns - self.time_ns) / SECOND_NS
+        self.time_ns = time_ns
+        tracks, claimed = self._updated(self._predicted(self.tracks, dt_s), values)
+        tracks = self._merged(tracks[tracks.existence >= self.params.deletion_existence])
+        free = values[~claimed]
+        self.tracks = dataclasses.replace(self._begun(tracks, free, dt_s), leftover=free)
+        return self._batch(self.tracks[self.tracks.confirmed])
+
+    def _predicted(self, tracks: PdaTracks, dt_s: float) -> PdaTracks:
+        mean, cov = extended.predict(tracks.mean, tracks.cov, self.motion.over(dt_s))
+        return dataclasses.replace(
+            tracks, mean=mean, cov=cov, existence=predict_existence(tracks.existence, self.params)
+        )
+
+    def _updated(self, tracks: PdaTracks, values: Array) -> tuple[PdaTracks, NDArray[np.bool_]]:
+        """Associate the scan with every track; tell also which detections tracks claim."""
+        candidate, present = self._candidates(tracks, values)
+        zs = values[candidate] if len(values) else np.zeros((*candidate.shape, values.shape[1]))
+        mean, cov, found = update(tracks.mean, tracks.cov, zs, present, self.sensor, self.params)
+        claimed = np.zeros(len(values), bool)
+        claimed[candidate[found.gated & (found.weight[..., :-1] >= CLAIMED)]] = True
+        existence = update_existence(tracks.existence, found.log_ratio)
+        confirmed = tracks.confirmed | (existence >= self.params.confirmation_existence)
+        return dataclasses.replace(tracks, mean=mean, cov=cov, existence=existence, confirmed=confirmed), claimed
+
+    def _candidates(self, tracks: PdaTracks, values: Array) -> tuple[Indices, NDArray[np.bool_]]:
+        """List, for each track, detections that may lie in its gate: indices (N, D'), which are there (N, D')."""
+        at = list(self.motion.layout.position)
+        gamma = SEARCH_MARGIN * chi_square_quantile(self.params.gate_probability, 2)
+        block = tracks.cov[:, at][:, :, at]
+        pairs = gate(tracks.mean[:, at], block, *self.sensor.positions(values), gamma, (0, 1))
+        count = np.bincount(pairs.row, minlength=len(tracks.mean))
+        width = int(count.max(initial=0))
+        candidate, present = np.zeros((len(count), width), np.intp), np.arange(width) < count[:, None]
+        candidate[present] = pairs.col
+        return candidate, present
+
+    def _merged(self, tracks: PdaTracks) -> PdaTracks:
+        """Drop tracks that have come to be another; of two the confirmed one stays, else the older."""
+        order = np.lexsort((tracks.track_id, ~tracks.confirmed))
+        tracks = tracks[order]
+        size = self.motion.layout.size
+        pairs = gate(
+            tracks.mean, tracks.cov, tracks.mean, tracks.cov,
+            chi_square_quantile(self.params.merge_probability, size), self.motion.layout.position,
+        )  # fmt: skip
+        stays = np.ones(len(tracks.mean), bool)
+        stays[pairs.col[pairs.row < pairs.col]] = False
+        tracks = tracks[stays]
+        return tracks[np.argsort(tracks.track_id)]
+
+    def _begun(self, tracks: PdaTracks, free: Array, dt_s: float) -> PdaTracks:
+        """Begin a track from each pair of unclaimed detections of the last scan and this that may be one target."""
+        layout = self.motion.layout
+        first, first_cov = self.sensor.positions(tracks.leftover)
+        moved = first_cov + (self.params.speed_sd * dt_s) ** 2 * np.eye(2)
+        now, now_cov = self.sensor.positions(free)
+        gamma = chi_square_quantile(self.params.gate_probability, 2)
+        pairs = gate(first, moved, now, now_cov, gamma, (0, 1))
+        mean, cov = np.zeros((len(first), layout.size)), np.zeros((len(first), layout.size, layout.size))
+        at, rate = np.array(layout.position), np.array(layout.velocity)
+        mean[:, at], cov[:, at[:, None], at] = first, first_cov
+        cov[:, rate, rate] = self.params.speed_sd**2
+        mean, cov = extended.predict(mean[pairs.row], cov[pairs.row], self.motion.over(dt_s))
+        mean, cov, _ = extended.update(mean, cov, free[pairs.col], self.sensor)
+        count = len(mean)
+        return PdaTracks(
+            np.concatenate([tracks.mean, mean]),
+            np.concatenate([tracks.cov, cov]),
+            np.concatenate([tracks.existence, np.full(count, self.params.birth_existence)]),
+            np.concatenate([tracks.confirmed, np.zeros(count, bool)]),
+            np.concatenate([tracks.track_id, tracks.next_id + np.arange(count)]),
+            tracks.leftover,
+            tracks.next_id + count,
+        )
+
+    def _batch(self, tracks: PdaTracks) -> TrackBatch:
+        if not len(tracks.mean):
+            return TrackBatch.empty(self.motion.layout, self.frame_id)
+        return TrackBatch.gaussian(
+            self.motion.layout, self.frame_id, tracks.mean, tracks.cov,
+            time_ns=self.time_ns, track_id=tracks.track_id, existence=tracks.existence, status=CONFIRMED,
+        )  # fmt: skip
