@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
 
 Array = NDArray[np.float64]
 
@@ -38,6 +40,59 @@ def covariance_intersection_slsqp(means: Array, covs: Array) -> tuple[Array, Arr
     )
     p = fused(result.x)
     return p @ sum(wi * i @ x for wi, i, x in zip(result.x, infos, means, strict=True)), p
+
+
+def inverse_covariance_intersection_minimize_scalar(x1: Array, p1: Array, x2: Array, p2: Array) -> tuple[Array, Array]:
+    """Fuse one pair by ICI: one bounded minimize_scalar over a function with np.linalg.inv."""
+    i1, i2 = np.linalg.inv(p1), np.linalg.inv(p2)
+
+    def cost(w: float) -> float:
+        return float(np.linalg.det(np.linalg.inv(i1 + i2 - np.linalg.inv(w * p1 + (1 - w) * p2))))
+
+    w = minimize_scalar(cost, bounds=(0, 1), method="bounded").x
+    common = np.linalg.inv(w * p1 + (1 - w) * p2)
+    p = np.linalg.inv(i1 + i2 - common)
+    return p @ (i1 @ x1 + i2 @ x2 - common @ (w * x1 + (1 - w) * x2)), p
+
+
+def harmonic_mean_minimize_scalar(x1: Array, p1: Array, x2: Array, p2: Array) -> tuple[Array, Array]:
+    """Fuse one pair by HMD-GA at the weight (77): one bounded minimize_scalar over a function with np.linalg.inv."""
+    i1, i2, spread = np.linalg.inv(p1), np.linalg.inv(p2), np.outer(x1 - x2, x1 - x2)
+
+    def common(w: float) -> Array:
+        return np.linalg.inv((1 - w) * p1 + w * p2 + w * (1 - w) * spread)
+
+    w = minimize_scalar(lambda w: np.linalg.det(common(w)), bounds=(0, 1), method="bounded").x
+    info = common(w)
+    p = np.linalg.inv(i1 + i2 - info)
+    return p @ (i1 @ x1 + i2 @ x2 - info @ ((1 - w) * x1 + w * x2)), p
+
+
+def covariance_union_slsqp(means: Array, covs: Array, free: bool) -> tuple[Array, Array]:
+    """Bound K tracks: one SLSQP over the Cholesky factor, with the lowest eigenvalue of each slack as a constraint."""
+    n, low = means.shape[1], np.tril_indices(means.shape[1])
+    size, centre = len(low[0]), means.mean(0)
+
+    def parts(v: Array) -> tuple[Array, Array]:
+        root = np.zeros((n, n))
+        root[low] = v[:size]
+        return root @ root.T, (v[size:] if free else centre)
+
+    def slack(v: Array) -> Array:
+        p, x = parts(v)
+        return np.array(
+            [np.linalg.eigvalsh(p - c - np.outer(x - m, x - m))[0] for m, c in zip(means, covs, strict=True)]
+        )
+
+    start = np.linalg.cholesky(sum(c + np.outer(centre - m, centre - m) for m, c in zip(means, covs, strict=True)))[low]
+    result = minimize(
+        lambda v: np.log(np.linalg.det(parts(v)[0])),
+        np.concatenate([start, centre]) if free else start,
+        method="SLSQP",
+        constraints={"type": "ineq", "fun": slack},
+    )
+    p, x = parts(result.x)
+    return x, p
 
 
 def lapack_floor(p1: Array, p2: Array) -> tuple[Array, Array, Array]:
@@ -112,3 +167,35 @@ def two_filters_and_intersection_looped(
 
 def _fused_trace(w: float, i1: Array, i2: Array) -> float:
     return float(np.trace(np.linalg.inv(w * i1 + (1 - w) * i2)))
+
+
+def mixture_log_pdf_loop(weight: Array, mean: Array, cov: Array, points: Array) -> Array:
+    """Log-density of a mixture: one scipy call a component."""
+    parts = zip(weight, mean, cov, strict=True)
+    return logsumexp([np.log(w) + multivariate_normal.logpdf(points, m, c) for w, m, c in parts], axis=0)
+
+
+def runnalls_loop(weight: Array, mean: Array, cov: Array, count: int) -> tuple[list[float], list[Array], list[Array]]:
+    """Merge the cheapest pair until `count` are left: the cost of every pair anew at every step."""
+    weights, means, covs = list(weight), list(mean), list(cov)
+
+    def merged(i: int, j: int) -> tuple[float, Array, Array]:
+        w, d = weights[i] + weights[j], means[i] - means[j]
+        m = (weights[i] * means[i] + weights[j] * means[j]) / w
+        p = (weights[i] * covs[i] + weights[j] * covs[j]) / w + weights[i] * weights[j] / w**2 * np.outer(d, d)
+        return w, m, p
+
+    def cost(i: int, j: int) -> float:
+        w, _, p = merged(i, j)
+        return 0.5 * float(
+            w * np.log(np.linalg.det(p))
+            - weights[i] * np.log(np.linalg.det(covs[i]))
+            - weights[j] * np.log(np.linalg.det(covs[j]))
+        )
+
+    while len(weights) > count:
+        pairs = ((i, j) for i in range(len(weights)) for j in range(i + 1, len(weights)))
+        i, j = min(pairs, key=lambda pair: cost(*pair))
+        weights[i], means[i], covs[i] = merged(i, j)
+        del weights[j], means[j], covs[j]
+    return weights, means, covs

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -11,16 +11,20 @@ from benchmark.measure import Result, race
 from track_fusion.rules import SourceTracks, get_rule
 
 AXES = 6
+#: x1, P1, x2, P2 -> x, P
+Fusion = Callable[..., tuple[baselines.Array, baselines.Array]]
 #: A baseline is timed on so many fusions of the batch and scaled up: it is a loop.
 SAMPLE = 50
 
 
 def run() -> Iterator[Result]:
-    """Measure covariance intersection of pairs and of five sources, and the other rules beside it."""
+    """Measure covariance intersection of pairs and of five sources, what subtracts a common part, and bounds."""
     for count in (1, 100, 1000, 10000):
         yield from _pairs(count, "det")
     yield from _pairs(1000, "trace", floor=False)
     yield from _five()
+    yield from _common_parts()
+    yield from _unions()
     yield from _others()
 
 
@@ -66,11 +70,47 @@ def _five(count: int = 1000, sample: int = 10) -> Iterator[Result]:
     yield Result(f"CI of 5 sources, det, {count} fusions", ours, f"SLSQP, {_micro(users)}", users / ours, at_least=50.0)
 
 
+def _common_parts(count: int = 1000) -> Iterator[Result]:
+    """Pairwise rules with a weight of their own to find: inverse intersection and the harmonic mean."""
+    tracks = _tracks(4, count, 2)
+    means, covs = tracks.mean[:SAMPLE], tracks.cov[:SAMPLE]
+    for key, baseline in (
+        ("inverse_covariance_intersection", baselines.inverse_covariance_intersection_minimize_scalar),
+        ("harmonic_mean", baselines.harmonic_mean_minimize_scalar),
+    ):
+        rule = get_rule(key)
+        params = rule.params()
+
+        def loop(baseline: Fusion = baseline) -> None:
+            for (x1, x2), (c1, c2) in zip(means, covs, strict=True):
+                baseline(x1, c1, x2, c2)
+
+        ours, users = race(lambda rule=rule, params=params: rule.fuse(tracks, params), loop)
+        ours, users = ours / count, users / len(means)
+        job = f"{rule.title}, det, {count} pairs"
+        yield Result(job, ours, f"minimize_scalar, {_micro(users)}", users / ours, at_least=20.0)
+
+
+def _unions() -> Iterator[Result]:
+    """Least-determinant bounds: of pairs about the arithmetic mean, of three sources about the best mean."""
+    rule = get_rule("covariance_union")
+    for sources, mean, count in ((2, "arithmetic", 1000), (3, "optimal", 50)):
+        tracks, params = _tracks(5, count, sources), rule.params(mean=mean)  # type: ignore[call-arg]
+        x, c = tracks.mean[0], tracks.cov[0]
+        ours, users = race(
+            lambda tracks=tracks, params=params: rule.fuse(tracks, params),
+            lambda x=x, c=c, mean=mean: baselines.covariance_union_slsqp(x, c, mean == "optimal"),
+        )
+        job = f"{rule.title} of {sources}, det, {mean} mean, {count} fusions"
+        yield Result(job, ours / count, f"SLSQP, {_micro(users)}", users * count / ours, at_least=20.0)
+
+
 def _others(count: int = 1000) -> Iterator[Result]:
     """Time every other pairwise use of the rules against covariance intersection, for orientation."""
     tracks = _tracks(3, count, 2)
     reference = get_rule("covariance_intersection")
-    for key in ("naive", "arithmetic_average"):
+    for key in ("naive", "fast_covariance_intersection", "ellipsoidal_intersection", "cross_covariance",
+                "arithmetic_average"):  # fmt: skip
         rule = get_rule(key)
         ours, other = race(
             lambda rule=rule: rule.fuse(tracks, rule.params()), lambda: reference.fuse(tracks, reference.params())

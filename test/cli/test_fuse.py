@@ -278,7 +278,51 @@ def test_a_bad_rule_or_parameter_is_refused(rule: str, params: str, line: str) -
     assert refused({"tracks": PAIR}, "--params", params, rule=rule).startswith(line)
 
 
-# What some rules need beyond the tracks: tried with a rule that needs it all.
+# What the registered rules need beyond the tracks.
+
+
+def test_known_cross_covariances_reach_the_rule() -> None:
+    """Two scalars of variance 4 and 9 with the covariance 3: the formula of Bar-Shalom and Campo."""
+    tracks = [{"mean": [1], "cov": [[4]]}, {"mean": [3], "cov": [[9]]}]
+    arguments = ("fuse", "--rule", "cross_covariance", "--params", '{"method": "given"}')
+    result = run(*arguments, stdin=json.dumps({"tracks": tracks, "cross_cov": [[3]]}))
+    assert result.exit_code == 0, result.stderr
+    answer = strict_json(result.stdout)
+    assert answer["cov"][0][0] == pytest.approx((36 - 9) / 7)
+    assert answer["mean"][0] == pytest.approx((6 * 1 + 1 * 3) / 7)
+    missing = run(*arguments, stdin=json.dumps({"tracks": tracks}))
+    assert (missing.exit_code, missing.stderr) == (
+        2, "cross_cov: is missing; rule 'cross_covariance' needs it\n"
+    )  # fmt: skip
+    useless = run("fuse", "--rule", "cross_covariance", stdin=json.dumps({"tracks": tracks, "cross_cov": [[3]]}))
+    assert useless.exit_code == 2
+    assert useless.stderr == "cross_cov: is nothing that rule 'cross_covariance' uses\n"
+
+
+def test_independent_parts_reach_the_rule_and_come_back() -> None:
+    tracks = [{**track, "independent_cov": track["cov"]} for track in PAIR]
+    result = run("fuse", "--rule", "split_covariance_intersection", stdin=json.dumps({"tracks": tracks}))
+    assert result.exit_code == 0, result.stderr
+    answer = strict_json(result.stdout)
+    np.testing.assert_allclose(answer["cov"], fused(PAIR, "naive")["cov"], rtol=1e-9)
+    np.testing.assert_allclose(answer["info"]["independent_cov"], answer["cov"], rtol=1e-9)
+
+
+def test_a_target_and_likelihoods_reach_the_average() -> None:
+    def weights(criterion: str, data: dict[str, Any]) -> list[float]:
+        params = json.dumps({"criterion": criterion})
+        result = run("fuse", "--rule", "arithmetic_average", "--params", params, stdin=json.dumps(data))
+        assert result.exit_code == 0, result.stderr
+        found: list[float] = strict_json(result.stdout)["weights"]
+        return found
+
+    likely = [{**FIRST, "likelihood": 3}, {**SECOND, "likelihood": 1}]
+    assert weights("likelihood", {"tracks": likely}) == pytest.approx([0.75, 0.25])
+    target = {"mean": SECOND["mean"], "cov": SECOND["cov"]}
+    assert weights("target", {"tracks": PAIR, "target": target}) == pytest.approx([0.0, 1.0], abs=1e-6)
+
+
+# Tried with a rule that needs it all.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -329,6 +373,15 @@ def test_extras_reach_the_rule_as_arrays(greedy: list[SourceTracks]) -> None:
     np.testing.assert_array_equal(extras["common"].weight, [1.0])
     np.testing.assert_array_equal(extras["common"].mean, [[0.0, 1.0]])
     np.testing.assert_array_equal(extras["target"].mean, [[0.0, 0.0], [2.0, 0.0]])
+
+
+def test_optional_extras_may_be_left_out(monkeypatch: pytest.MonkeyPatch, greedy: list[SourceTracks]) -> None:
+    modest = dataclasses.replace(RULES["greedy"], needs=(), optional=NEEDS)
+    monkeypatch.setitem(RULES, "greedy", modest)
+    for data in ({"tracks": PAIR}, {"tracks": PAIR, "seed": 3}, GREEDY):
+        result = run("fuse", "--rule", "greedy", stdin=json.dumps(data))
+        assert result.exit_code == 0, result.stderr
+    assert [set(tracks.extras) for tracks in greedy] == [set(), {"seed"}, set(NEEDS)]
 
 
 def test_cross_covariances_of_several_tracks_are_blocks(greedy: list[SourceTracks]) -> None:

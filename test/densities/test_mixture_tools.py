@@ -164,9 +164,9 @@ def test_the_three_point_estimates_differ_where_they_should() -> None:
 
 @pytest.mark.parametrize("n", [1, 3])
 def test_global_mode_is_the_best_of_an_independent_optimiser(n: int) -> None:
-    batch = draw(np.random.default_rng(7), 6, count=5, n=n, spread=1.5)
+    batch = draw(np.random.default_rng(7), 4, count=4, n=n, spread=1.5)
     modes = extraction.global_mode(batch)
-    for k in range(6):
+    for k in range(4):
         mixture = batch.at(k)
 
         def fall(x: Array, mixture: Mixture = mixture) -> float:

@@ -128,6 +128,10 @@ def good_table(at_ns: int) -> PointCloud2:
     return track_table(at_ns, GOOD, COVS["left"])
 
 
+def phd_table(at_ns: int) -> PointCloud2:
+    return track_table_to_msg(dataclasses.replace(read(good_table(at_ns)), phd=True), AXES, at_ns)
+
+
 NAN, HUGE = float("nan"), 1e200
 INDEFINITE = np.diag([1.0, 1.0, 1.0, -1.0])
 HEADER_CASES: list[tuple[str, Callable[[Any], None]]] = [
@@ -164,6 +168,7 @@ TABLE_CASES: list[tuple[str, Callable[[int], PointCloud2]]] = [
     ("missing_field", spoilt(without_field("weight"), good_table)),
     ("missing_field", spoilt(without_field("cov_x_vy"), good_table)),
     ("missing_axis", spoilt(without_field("x"), good_table)),
+    ("phd_mixture", phd_table),
     ("missing_axis", spoilt(without_field("cov_vy_vy"), good_table)),
     ("out_of_order_scan", spoilt(shift(-2 * PERIOD_NS + 1), good_table)),
     ("duplicate_scan", spoilt(shift(-PERIOD_NS), good_table)),

@@ -26,7 +26,10 @@ def gaussian(mean: Array, cov: Array) -> Mixture:
 
 # Target (39) ----------------------------------------------------------------------------------------------------------
 
-FOUR_MEANS, FOUR_COVS = np.array([[40.0], [50.0], [60.0], [100.0]]), np.array([400.0, 200.0, 100.0, 400.0])[:, None, None]
+FOUR_MEANS, FOUR_COVS = (
+    np.array([[40.0], [50.0], [60.0], [100.0]]),
+    np.array([400.0, 200.0, 100.0, 400.0])[:, None, None],
+)
 
 
 @pytest.mark.parametrize(
@@ -92,7 +95,10 @@ def test_a_target_of_one_track_takes_that_track_and_a_mixture_counts_by_its_mome
 def _bound(weights: Array, mean: Array, cov: Array) -> float:
     """Sum of w_i log(|P_i|^1/2 sum of w_j N(m_i; m_j, P_i + P_j)), as the paper prints it."""
     overlap = np.array(
-        [[multivariate_normal(m, p + q).pdf(x) for m, q in zip(mean, cov, strict=True)] for x, p in zip(mean, cov, strict=True)]
+        [
+            [multivariate_normal(m, p + q).pdf(x) for m, q in zip(mean, cov, strict=True)]
+            for x, p in zip(mean, cov, strict=True)
+        ]
     )
     return float(weights @ (0.5 * np.linalg.slogdet(cov)[1] + np.log(overlap @ weights)))
 
@@ -218,7 +224,9 @@ def test_lemma_5_the_mixture_fits_better_than_its_components_on_average() -> Non
     mean, cov, weights = np.array([[-2.0], [0.0], [6.0]]), np.array([4.0, 1.0, 9.0])[:, None, None], (0.5, 0.3, 0.2)
     fused = fuse(mean, cov, criterion="given", weights=weights, output="mixture")
     assert fused.mixture is not None
-    logs = [norm(m, np.sqrt(p)).logpdf(x) for m, p in zip(fused.mixture.mean[:, 0], fused.mixture.cov[:, 0, 0], strict=True)]
+    logs = [
+        norm(m, np.sqrt(p)).logpdf(x) for m, p in zip(fused.mixture.mean[:, 0], fused.mixture.cov[:, 0, 0], strict=True)
+    ]
     mixture = np.log(np.einsum("k,kx->x", fused.mixture.weight, np.exp(logs)))
 
     def divergence(f: Array, g: Array) -> float:

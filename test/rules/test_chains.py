@@ -1,4 +1,4 @@
-"""The conservative fusion chains (13) and (19) of Li 2022, in trace and in the Loewner order where ERRATA.md says so."""
+"""The fusion chains (13) and (19) of Li 2022, in trace, and in the Loewner order where ERRATA.md says so."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ def test_chain_13_in_trace(tracks: tuple[Array, Array]) -> None:
     """Naive < min P <= CU min <= AA <= CU max."""
     mean, cov = tracks
     chain = [
-        trace(fused("naive", mean, cov)), trace(cov).min(1), trace(fused("covariance_union", mean, cov, bound="min_trace")),
+        trace(fused("naive", mean, cov)), trace(cov).min(1),
+        trace(fused("covariance_union", mean, cov, bound="min_trace")),
         trace(fused("arithmetic_average", mean, cov, criterion="uniform")),
         trace(fused("covariance_union", mean, cov, bound="max_trace")),
         trace(fused("covariance_union", mean, cov, criterion="trace")),

@@ -119,7 +119,7 @@ def test_hard_pairs_against_mpmath(key: str, kind: str, condition: float, omega:
 
 @pytest.mark.parametrize("condition", [1e2, 1e7, 1e13])
 def test_ellipsoidal_intersection_against_the_paper_s_construction(condition: float) -> None:
-    """ERRATA.md: P1 = S D S', D^-1/2 S' P2 S D^-1/2 = S2 D2 S2', C = S D^1/2 S2 max(D2, 1) S2' D^1/2 S', in 40 digits."""
+    """P1 = S D S', D^-1/2 S' P2 S D^-1/2 = S2 D2 S2', C = S D^1/2 S2 max(D2, 1) S2' D^1/2 S', in 40 digits."""
     rng = np.random.default_rng(3)
     cov, mean = _hard("rotated", condition, rng), rng.normal(size=(2, 4))
     values, vectors = mp.eigsy(exact(cov[0]))

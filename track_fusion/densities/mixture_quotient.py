@@ -102,9 +102,8 @@ def exact_bound(quotient: Quotient, common: Mixture) -> Bound:
     tightest = np.take_along_axis(rest, least[..., None, None], -3)[..., 0, :, :]
     safe = np.where(sure[..., None, None], tightest, np.eye(n))
     cov = symmetrise(lower @ np.linalg.solve(safe, transpose(lower)))
-    bound = np.take_along_axis(kappa, least, -1)[..., 0]
-    log_weight = np.where(np.isfinite(numerator.log_weight), numerator.log_weight + bound, -np.inf)
-    return Bound(log_weight, cov, sure)
+    bound = np.where(np.isfinite(numerator.log_weight), np.take_along_axis(kappa, least, -1)[..., 0], 0.0)
+    return Bound(numerator.log_weight + bound, cov, sure)
 
 
 def wep_bound(first: Mixture, second: Mixture, omega: Array) -> Array:

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.mixture import Mixture, moments
-from track_fusion.linalg import Array, cholesky, logdet, matvec, outer, whitener
+from track_fusion.linalg import Array, cholesky, logdet, matvec, outer, symmetrise, whitener
 
-#: Pairs whose merged covariances are factored at once.
-PAIRS = 4096
+#: Pairs whose merged covariances are factored at once: few enough to stay in the cache.
+PAIRS = 512
 
 
 class Parts(NamedTuple):
@@ -77,33 +77,27 @@ def salmond(mixture: Mixture, count: int) -> Mixture:
 
     def cost(first: Parts, second: Parts) -> Array:
         z = matvec(white, first.mean - second.mean)
-        return np.asarray(_harmonic(first.weight, second.weight, first.weight + second.weight) * (z * z).sum(-1))
+        return np.asarray(first.weight * second.weight / (first.weight + second.weight) * (z * z).sum(-1))
 
     return _merge_pairs(mixture, count, cost)
 
 
-def _harmonic(a: Array, b: Array, total: Array) -> Array:
-    """Return a b / (a + b), zero at zero."""
-    return np.asarray(a * b / np.maximum(total, TINY))
-
-
-TINY = float(np.finfo(float).tiny)
-
-
 def _runnalls_cost(first: Parts, second: Parts) -> Array:
     weight, n = first.weight + second.weight, first.mean.shape[-1]
-    scatter = outer(np.sqrt(_harmonic(first.weight, second.weight, weight))[..., None] * (first.mean - second.mean))
+    gap = first.mean - second.mean
+    gap *= np.sqrt(first.weight * second.weight / weight)[..., None]
+    scatter = outer(gap)
     scatter += first.scatter
     scatter += second.scatter
-    if not weight.all():
-        scatter[weight == 0.0] = np.eye(n)
-    lower = cholesky(scatter)
-    logdets = np.log(lower.reshape(*weight.shape, n * n)[..., :: n + 1]).sum(-1)
-    # w log det of (scatter / w), less the same of both apart; half of it.
-    return np.asarray(weight * (logdets - 0.5 * n * np.log(np.maximum(weight, TINY)))
-                      - 0.5 * (first.entropy + second.entropy))  # fmt: skip
+    diagonal = cholesky(scatter).reshape(*weight.shape, n * n)[..., :: n + 1]
+    half_logdet: Array = np.log(diagonal) @ np.ones(n) - 0.5 * n * np.log(weight)
+    half_logdet *= weight
+    half_logdet -= 0.5 * (first.entropy + second.entropy)
+    return half_logdet
 
 
+#: Stands for no weight, so that a component without it can be merged like any other; no weight comes near it.
+WEIGHTLESS = 1e-200
 #: Components that are gone are cleared away when so small a share is left.
 COMPACT_AT = 0.8
 
@@ -115,7 +109,7 @@ def _merge_pairs(mixture: Mixture, count: int, cost: Cost) -> Mixture:
     (*lead, size), n = mixture.weight.shape, mixture.mean.shape[-1]
     if size <= count:
         return mixture
-    weight, cov = mixture.weight.reshape(-1, size), mixture.cov.reshape(-1, size, n, n)
+    weight, cov = np.maximum(mixture.weight, WEIGHTLESS).reshape(-1, size), mixture.cov.reshape(-1, size, n, n)
     entropy, scatter = weight * logdet(cov), (weight[..., None, None] * cov).reshape(-1, size, n * n)
     mean = mixture.mean.reshape(-1, size, n)
     parts = np.concatenate([weight[..., None], entropy[..., None], mean, scatter], -1)
@@ -125,11 +119,10 @@ def _merge_pairs(mixture: Mixture, count: int, cost: Cost) -> Mixture:
             parts, costs, gone = _compacted(parts, costs, gone, left)
         _merge_cheapest(parts, costs, gone, n, cost)
     found = Parts.of(_compacted(parts, costs, gone, count)[0], n)
-    heavy = found.weight[..., None, None] > 0.0
-    # A component without weight has no covariance either: it gets one that is valid.
-    cov = np.where(heavy, found.scatter / np.where(heavy, found.weight[..., None, None], 1.0), cov[:, :1])
+    cov = symmetrise(found.scatter / found.weight[..., None, None])
+    weight = np.where(found.weight > size * WEIGHTLESS, found.weight, 0.0)
     mean = found.mean.reshape(*lead, count, n)
-    return Mixture(found.weight.reshape(*lead, count), mean, cov.reshape(*lead, count, n, n))
+    return Mixture(weight.reshape(*lead, count), mean, cov.reshape(*lead, count, n, n))
 
 
 def _all_costs(parts: Array, n: int, cost: Cost) -> Array:
@@ -153,7 +146,7 @@ def _merge_cheapest(parts: Array, costs: Array, gone: Array, n: int, cost: Cost)
     one, other = parts[rows, i], parts[rows, j]
     merged = one + other
     gap = other[:, 2 : 2 + n] - one[:, 2 : 2 + n]
-    share = other[:, :1] / np.maximum(merged[:, :1], TINY)
+    share = other[:, :1] / merged[:, :1]
     merged[:, 1] += 2.0 * costs[rows, i, j]  # Runnalls' cost is half the growth of the entropy terms
     merged[:, 2 : 2 + n] = one[:, 2 : 2 + n] + share * gap
     merged[:, 2 + n :] += (one[:, :1] * share) * outer(gap).reshape(batch, n * n)

@@ -37,8 +37,11 @@ def screened_tracks(node: ManagedNode, arrays: TrackArrays, layout: StateLayout)
 
     Raises
     ------
-    MessageError    `missing_axis`: the message lacks an axis of the layout
+    MessageError    `missing_axis`: the message lacks an axis of the layout; `phd_mixture`: it holds un-normalised
+                    mixtures, which say how many targets there are and not where one is
     """
+    if arrays.phd:
+        raise MessageError("phd_mixture", "The rows are un-normalised (PHD) mixtures; this node takes one target each.")
     fields = {name: value for name, value in vars(arrays).items() if name != "axes"}
     batch, rejected = TrackBatch.screened(layout=StateLayout(arrays.axes), **fields)
     if rejected:

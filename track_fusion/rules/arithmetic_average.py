@@ -10,6 +10,7 @@ import numpy as np
 from track_fusion.densities.bound_weights import bound_weights
 from track_fusion.densities.gaussian import merge, merge_near
 from track_fusion.densities.merging_weights import merging_weights
+from track_fusion.densities.mixture_algebra import average
 from track_fusion.linalg import Array
 from track_fusion.optimise import Solution
 from track_fusion.params import Params, param
@@ -98,9 +99,7 @@ def _mixture(tracks: SourceTracks, weights: Array) -> Mixture:
     """List the components of all sources, weighted by their source."""
     if tracks.mixture is None:
         return Mixture(weights, tracks.mean, tracks.cov)
-    part, (*batch, n) = tracks.mixture, (*tracks.mean.shape[:-2], tracks.mean.shape[-1])
-    weight = (weights[..., None] * part.weight).reshape(*batch, -1)
-    return Mixture(weight, part.mean.reshape(*batch, -1, n), part.cov.reshape(*batch, -1, n, n))
+    return average(tracks.mixture, weights)
 
 
 def _sought(tracks: SourceTracks, criterion: str) -> Solution:

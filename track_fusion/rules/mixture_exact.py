@@ -183,8 +183,9 @@ class Problem:
         weight = np.where(bad, -np.inf, self.quotient.numerator.log_weight)
         none_left = ~np.isfinite(weight).any(-1) & ~self.exempt
         if (bad.any() and params.not_integrable == "refuse") or none_left.any():
+            pairs = np.isfinite(self.quotient.numerator.log_weight).sum()
             raise ValueError(
-                f"The quotient by the extra 'common' has no integral for {bad.sum()} of {bad.size} pairs of "
+                f"The quotient by the extra 'common' has no integral for {bad.sum()} of {pairs} pairs of "
                 "components: along some direction their product is no sharper than any component of 'common'. "
                 "The parameter 'not_integrable' = 'skip' leaves such pairs out, if others remain."
             )

@@ -216,7 +216,7 @@ def _pcci(first: Mixture, second: Mixture, found: Omega, params: MixtureWepParam
     rule = covariance_intersection.RULE
     fused = rule.fuse(SourceTracks(pairs.mean, pairs.cov), rule.params())
     assert fused.weights is not None
-    log_weight = np.where(fused.weights > 0.0, fused.weights * log_of(pairs.weight), 0.0).sum(-1)
+    log_weight = (fused.weights * np.where(fused.weights > 0.0, log_of(pairs.weight), 0.0)).sum(-1)
     info = {"converged": fused.info["converged"].all(-1), "iterations": fused.info["iterations"].sum(-1)}
     return Mixture(normalised(log_weight), fused.mean, fused.cov), info
 

@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.linalg import Array, inverse, is_positive_definite, matvec, symmetrise, transpose
-from track_fusion.optimise import GradientHessian, Solution, minimise_on_simplex
+from track_fusion.linalg import Array, inverse, matvec, symmetrise, transpose
+from track_fusion.optimise import GradientHessian, minimise_on_simplex
 from track_fusion.params import Params, param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
 
-#: An independent part may exceed the covariance it is a part of by this share of the tracks' sum: rounding.
+#: An independent part may leave the range from nothing to the covariance by this share of that: rounding.
 ROUNDING = 1e-9
 #: A weight below this is taken as this: the limit at zero, where a track gives only what is surely independent.
 SMALLEST = 1e-14
@@ -73,7 +73,7 @@ def fuse(tracks: SourceTracks, params: SplitCovarianceIntersectionParams) -> Fus
     elif params.criterion == "uniform" or count == 1:
         weights = np.full(mean.shape[:2], 1.0 / count)
     else:
-        found = _optimal(parts, params.criterion)
+        found = minimise_on_simplex(_gradient_hessian(parts, params.criterion), len(mean), count)
         weights = found.weights
         info = {"converged": found.converged.reshape(batch), "iterations": found.iterations.reshape(batch)}
     if count == 1:
@@ -97,72 +97,92 @@ def _independent(tracks: SourceTracks) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class _Parts:
-    """Tracks whitened by the sum of their covariances, L L': points (B, K, n), shared and alone (B, K, n, n)."""
+    """Tracks whitened by the sum of their covariances, L L', each part diagonal in the frame U of its track.
+
+    P_i = T T', I_i = T diag(alone) T', D_i = T diag(1 - alone) T', T = U^-1; so the information of track i at weight w
+    is U' diag(w / (1 - alone + w alone)) U.
+
+    Attributes
+    ----------
+    lower : (B, n, n)       L
+    points : (B, K, n)      the means, from the first
+    frame : (B, K, n, n)    U
+    alone : (B, K, n)       independent share of each axis, in [0, 1]
+    """
 
     lower: Array
     points: Array
-    shared: Array
+    frame: Array
     alone: Array
 
     @classmethod
-    def of(cls, mean: Array, cov: Array, alone: Array) -> _Parts:
+    def of(cls, mean: Array, cov: Array, part: Array) -> _Parts:
         lower = np.linalg.cholesky(cov.sum(1))
         whiten = np.linalg.inv(lower)[:, None]
-        alone = symmetrise(whiten @ alone @ transpose(whiten))
-        shared = symmetrise(whiten @ cov @ transpose(whiten)) - alone
-        slack = ROUNDING * np.eye(mean.shape[-1])
-        for part, text in ((alone, "be positive semi-definite"), (shared, "not exceed 'cov'")):
-            if not is_positive_definite(part + slack).all():
-                lowest = np.linalg.eigvalsh(part).min()
-                raise ValueError(
-                    f"The 'independent_cov' of source tracks must {text}. Relative to the tracks' sum, the lowest "
-                    f"eigenvalue {'of it' if part is alone else 'of what it leaves'} is {lowest:.3g}."
-                )
-        return cls(lower, matvec(whiten, mean - mean[:, :1]), shared, alone)
+        own = np.linalg.inv(np.linalg.cholesky(symmetrise(whiten @ cov @ transpose(whiten))))
+        rooted = own @ whiten
+        share, vectors = np.linalg.eigh(symmetrise(rooted @ part @ transpose(rooted)))
+        if share.size and share.min() < -ROUNDING:
+            raise ValueError(
+                "The 'independent_cov' of source tracks must be positive semi-definite. "
+                f"Its lowest eigenvalue relative to 'cov' is {share.min():.3g}."
+            )
+        if share.size and share.max() > 1.0 + ROUNDING:
+            raise ValueError(
+                "The 'independent_cov' of source tracks must not exceed 'cov'. "
+                f"Its largest eigenvalue relative to 'cov' is {share.max():.3g}."
+            )
+        return cls(lower, matvec(whiten, mean - mean[:, :1]), transpose(vectors) @ own, np.clip(share, 0.0, 1.0))
 
-    def info(self, weights: Array, rows: NDArray[np.intp] | slice = slice(None)) -> Array:
-        """(D_i / w_i + I_i)^-1, (B, K, n, n)."""
-        share = np.maximum(weights, SMALLEST)[..., None, None]
-        return inverse(self.shared[rows] / share + self.alone[rows])
+    def value(self, weights: Array, rows: NDArray[np.intp] | slice = slice(None)) -> tuple[Array, Array]:
+        """Diagonal of each track's information in its frame, and w / diagonal, (B, K, n)."""
+        weights = np.maximum(weights, SMALLEST)[..., None]
+        alone = self.alone[rows]
+        total = (1.0 - alone) + weights * alone
+        return weights / total, total
 
     def fused_at(self, weights: Array, origin: Array) -> tuple[Array, Array, Array]:
         """Fused mean (B, n), covariance and its independent part (B, n, n)."""
-        info = self.info(weights)
+        value, _ = self.value(weights)
+        info = _rebuilt(self.frame, value)
         cov = inverse(info.sum(1))
         gain = cov[:, None] @ info
         mean = origin + matvec(self.lower, matvec(gain, self.points).sum(1))
-        alone = (gain @ self.alone @ transpose(gain)).sum(1)
+        alone = cov @ _rebuilt(self.frame, value * self.alone * value).sum(1) @ cov
         whole, part = (symmetrise(self.lower @ a @ transpose(self.lower)) for a in (cov, alone))
         return mean, whole, part
 
 
-def _optimal(parts: _Parts, criterion: str) -> Solution:
-    """Weights of least log det P or tr P."""
-    batch, count, n = parts.points.shape
-    return minimise_on_simplex(_gradient_hessian(parts, criterion), batch, count)
+def _rebuilt(frame: Array, diagonal: Array) -> Array:
+    """U' diag(d) U."""
+    return symmetrise((transpose(frame) * diagonal[..., None, :]) @ frame)
 
 
 def _gradient_hessian(parts: _Parts, criterion: str) -> GradientHessian:
-    """Derivatives over the weights: with A = (D / w + I)^-1, A' = A D A / w^2 and A'' = -2 A I A' / w."""
-    n = parts.points.shape[-1]
+    """Derivatives of log det P, or of tr P over that at equal weights, from those of each track's information.
+
+    With a the independent share, w / (1 - a + w a) has the derivatives (1 - a) / (1 - a + w a)^2 and
+    -2 a (1 - a) / (1 - a + w a)^3.
+    """
+    count, n = parts.points.shape[1:]
+    equal = _rebuilt(parts.frame, parts.value(np.full(parts.points.shape[:2], 1.0 / count))[0])
     units = transpose(parts.lower) @ parts.lower
-    start = inverse(parts.info(np.full(parts.points.shape[:2], 1.0 / parts.points.shape[1])).sum(1))
-    units = units / (units * start).sum((1, 2))[:, None, None]
+    units = units / (units * inverse(equal.sum(1))).sum((1, 2))[:, None, None]
 
     def gradient_hessian(w: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
-        info, share = parts.info(w, rows), np.maximum(w, SMALLEST)[..., None, None]
-        cov = inverse(info.sum(1))
+        frame, alone = parts.frame[rows], parts.alone[rows]
+        value, total = parts.value(w, rows)
+        cov = inverse(_rebuilt(frame, value).sum(1))
         worth = cov if criterion == "det" else cov @ units[rows] @ cov
-        scaled = info / share
-        rise = scaled @ parts.shared[rows] @ transpose(scaled)
-        bend = symmetrise(scaled @ parts.alone[rows] @ rise)
-        flat = rise.reshape(*w.shape, n * n)
-        gradient = -(flat @ worth.reshape(len(w), n * n, 1))[..., 0]
-        image = (cov[:, None] @ rise @ worth[:, None]).reshape(flat.shape)
+        rise = (1.0 - alone) / total**2
+        length = (frame @ worth[:, None] * frame).sum(-1)  # diagonal of U worth U'
+        gradient = -(rise * length).sum(-1)
+        slope = _rebuilt(frame, rise)
+        flat, image = slope.reshape(*w.shape, n * n), (cov[:, None] @ slope @ worth[:, None]).reshape(*w.shape, n * n)
         hessian = flat @ transpose(image)
         hessian = hessian if criterion == "det" else hessian + transpose(hessian)
-        diagonal = np.arange(w.shape[1])
-        hessian[:, diagonal, diagonal] += 2.0 * (bend * worth[:, None]).sum((2, 3))
+        diagonal = np.arange(count)
+        hessian[:, diagonal, diagonal] += 2.0 * (rise * alone / total * length).sum(-1)
         return gradient, hessian
 
     return gradient_hessian
