@@ -16,7 +16,7 @@ ADAPTERS = sorted((ROOT / "msg_adapters").rglob("*.py"))
 
 # A module imports from its own layer or those below. What stands in none of them is an application of the library.
 LAYERS = (
-    {"params", "linalg", "tracks", "optimise", "random_streams", "chi_square"},
+    {"params", "linalg", "tracks", "optimise", "least_squares", "random_streams", "chi_square"},
     {"densities", "models"},
     {"rules", "filters", "association"},
     {"track_manager", "scan_buffer", "metrics"},
