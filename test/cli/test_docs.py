@@ -39,13 +39,33 @@ def test_the_files_on_disk_are_up_to_date() -> None:
 def test_check_names_what_differs_and_writes_nothing(tree: Path) -> None:
     result = run("docs", "--check", "--root", str(tree))
     assert result.exit_code == 1
-    named = "doc/rules.md, config/fusion_centre.yaml, config/sensor_tracker.yaml"
+    named = "doc/rules.md, doc/choosing-a-rule.md, config/fusion_centre.yaml, config/sensor_tracker.yaml"
     assert result.stderr == f"Out of date: {named}. Run: track-fusion docs\n"
     assert [p.name for p in tree.iterdir()] == ["package.xml"]
     assert run("docs", "--root", str(tree)).exit_code == 0
     assert run("docs", "--check", "--root", str(tree)).stdout == "All generated files are up to date.\n"
     (tree / "doc" / "rules.md").write_text("old")
     assert run("docs", "--check", "--root", str(tree)).stderr == "Out of date: doc/rules.md. Run: track-fusion docs\n"
+
+
+def test_the_picture_shows_every_rule_that_two_tracks_are_enough_for(tree: Path) -> None:
+    pytest.importorskip("matplotlib")
+    result = run("docs", "--picture", "--root", str(tree))
+    assert result.exit_code == 0, result.stderr
+    enough = [rule for rule in RULES.values() if not rule.needed(rule.params())]
+    assert f"Drew {len(enough)} rules in doc/rules.png" in result.stdout
+    assert (tree / "doc" / "rules.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_guide_names_rules_that_exist_and_tells_of_each_its_promise() -> None:
+    page = (ROOT / "doc" / "choosing-a-rule.md").read_text()
+    advice, _, table = page.partition("<!-- begin")
+    first_columns = re.findall(r"^\|[^|]*\| (`[^|]*) \|", advice, re.MULTILINE)
+    advised = {name for cell in first_columns for name in re.findall(r"`([a-z_]+)`(?! < 1)", cell)}
+    options = {name for rule in RULES.values() for name in specs(rule.params)}
+    assert advised - options <= set(RULES)
+    for rule in RULES.values():
+        assert f"| [`{rule.key}`](rules.md#{rule.key}) | {rule.guarantee} |" in table
 
 
 def test_elsewhere_than_in_a_source_tree_it_is_refused(tmp_path: Path) -> None:

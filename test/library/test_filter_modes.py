@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from track_fusion.densities.mixture import Mixture
 from track_fusion.filters import gaussian_sum_modes, kalman
 from track_fusion.filters import interacting_multiple_model as imm
 from track_fusion.filters.gaussian_sum_modes import MixtureModes
 from track_fusion.filters.interacting_multiple_model import Modes
 from track_fusion.models.measurement import LinearSensor, RangeRangeRateSensor
 from track_fusion.models.turn import KnownTurn, KnownTurnParams
-from track_fusion.rules.base import Mixture
 from track_fusion.tracks import planar_layout
 
 LAYOUT = planar_layout()
@@ -63,7 +63,7 @@ def test_gaussian_sums_without_reduction_are_the_exact_posterior(steps, jump_fir
     modes = MixtureModes(START, Mixture(np.ones((3, 1)), np.tile(MEAN, (3, 1, 1)), np.tile(COV, (3, 1, 1, 1))))
     total = 0.0
     for z in SEEN[:steps]:
-        modes = gaussian_sum_modes.predict(modes, TRANSITIONS, CHAIN, keep_all, 3**steps, jump_first)
+        modes = gaussian_sum_modes.predict(modes, TRANSITIONS, CHAIN, 3**steps, keep_all, jump_first)
         modes, likelihood = gaussian_sum_modes.update(modes, z, SENSOR)
         total += likelihood
     evidence, probability, mean, cov = enumerated(steps, jump_first)
@@ -132,10 +132,53 @@ def test_gaussian_sums_of_one_component_are_the_imm():
     sums = MixtureModes(START, Mixture(np.ones((3, 1)), modes.mean[:, None], modes.cov[:, None]))
     for z in SEEN:
         modes, _ = imm.update(imm.predict(modes, TRANSITIONS, CHAIN, jump_first=False), z, SENSOR)
-        sums, _ = gaussian_sum_modes.update(gaussian_sum_modes.predict(sums, TRANSITIONS, CHAIN, to_one, 1), z, SENSOR)
+        sums, _ = gaussian_sum_modes.update(gaussian_sum_modes.predict(sums, TRANSITIONS, CHAIN, 1, to_one), z, SENSOR)
     np.testing.assert_allclose(sums.probability, modes.probability, rtol=1e-10)
     np.testing.assert_allclose(sums.mixture.mean[:, 0], modes.mean, rtol=1e-10)
     np.testing.assert_allclose(sums.mixture.cov[:, 0], modes.cov, rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("jump_first", [True, False])
+def test_reduced_by_runnalls_the_sums_stay_near_the_enumeration(jump_first):
+    modes = MixtureModes(START, Mixture(np.ones((3, 1)), np.tile(MEAN, (3, 1, 1)), np.tile(COV, (3, 1, 1, 1))))
+    for z in SEEN:
+        modes = gaussian_sum_modes.predict(modes, TRANSITIONS, CHAIN, 4, jump_first=jump_first)
+        modes, _ = gaussian_sum_modes.update(modes, z, SENSOR)
+        assert modes.mixture.weight.shape[-1] <= 4
+    _, probability, mean, cov = enumerated(3, jump_first)
+    np.testing.assert_allclose(modes.probability, probability, atol=5e-3)
+    np.testing.assert_allclose(modes.moments[0], mean, atol=0.01 * np.sqrt(cov.max()))
+    np.testing.assert_allclose(modes.moments[1], cov, atol=0.01 * cov.max())
+
+
+def test_range_and_its_rate_against_a_million_samples():
+    """Ahmed 5.4 with one platform: mode probabilities and mean by brute importance sampling over modes and noise."""
+    rng, steps, count = np.random.default_rng(5), 3, 1_000_000
+    sensor = RangeRangeRateSensor(LAYOUT, 20.0, 1.0, (0.0, -10e3))
+    mean, cov = np.array([5e3, 100.0, 0.0, 375.0]), np.diag([500.0, 500.0, 100.0, 100.0])
+    truth, zs = mean, []
+    for _ in range(steps):
+        truth = TRANSITIONS[1].advance(truth)
+        zs.append(sensor.observe(truth) + [10.0, 0.5])
+    x = mean + rng.normal(size=(count, 4)) * np.sqrt(np.diag(cov))
+    mode, log = rng.choice(3, count, p=START), np.zeros(count)
+    for z in zs:
+        for m, transition in enumerate(TRANSITIONS):
+            at = mode == m
+            x[at] = transition.advance(x[at]) + rng.normal(size=(at.sum(), 4)) @ transition.noise_factor.T
+        mode = (rng.random(count)[:, None] > np.cumsum(CHAIN[mode], 1)).sum(1)
+        log -= 0.5 * ((z - sensor.observe(x)) ** 2 / np.diag(sensor.noise)).sum(1)
+    weight = np.exp(log - log.max())
+    weight /= weight.sum()
+    assert 1 / (weight**2).sum() > 1000
+    modes = MixtureModes(START, Mixture(np.ones((3, 1)), np.tile(mean, (3, 1, 1)), np.tile(cov, (3, 1, 1, 1))))
+    for z in zs:
+        modes, _ = gaussian_sum_modes.update(gaussian_sum_modes.predict(modes, TRANSITIONS, CHAIN, 12), z, sensor)
+    wanted = weight @ x
+    spread = (weight[:, None] * (x - wanted)).T @ (x - wanted)
+    np.testing.assert_allclose(modes.probability, [weight[mode == m].sum() for m in range(3)], atol=0.03)
+    assert (np.abs(modes.moments[0] - wanted) < 0.1 * np.sqrt(np.diag(spread))).all()
+    np.testing.assert_allclose(np.diag(modes.moments[1]), np.diag(spread), rtol=0.1)
 
 
 def test_modes_are_recognised():

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from track_fusion.densities.mixture import Mixture
 from track_fusion.filters.negative_information import update
 from track_fusion.models.detection import SoftmaxDetector
-from track_fusion.rules.base import Mixture
 from track_fusion.tracks import StateLayout, planar_layout
 
 PLANE = StateLayout(("x", "y"))

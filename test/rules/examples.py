@@ -247,7 +247,8 @@ EXAMPLES: dict[str, Example] = {
     "ellipsoidal_intersection": Example(counter_example=_ellipsoidal_intersection),
     "covariance_union": Example(
         params=(
-            {}, TRACE, {"weights": EACH}, {"mean": "optimal"}, {**TRACE, "mean": "optimal"}, {"bound": "max_trace"},
+            {}, TRACE, {"weights": EACH}, {"mean": "diversity"}, {"mean": "optimal"},
+            {**TRACE, "mean": "optimal"}, {"bound": "max_trace"},
             {"bound": "min_trace"},
         ),
         guaranteed=({}, TRACE),

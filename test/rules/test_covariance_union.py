@@ -253,14 +253,28 @@ def test_above_the_arithmetic_average_about_the_same_mean() -> None:
         assert np.linalg.eigvalsh(fuse(x, p, criterion=criterion).cov - average.cov).min() > -1e-9
 
 
+@CRITERIA
+@pytest.mark.parametrize("count", [2, 3])
+def test_about_the_mean_of_the_arithmetic_average(criterion: str, count: int) -> None:
+    """x_AA of Li 2022, at the weights (40), and still above the average itself."""
+    rng = np.random.default_rng(10)
+    x, p = rng.normal(size=(30, count, 4)), covariances(rng, 30, count)
+    average = get_rule("arithmetic_average")(SourceTracks(x, p))
+    fused = fuse(x, p, mean="diversity", criterion=criterion)
+    np.testing.assert_allclose(fused.mean, average.mean, atol=1e-9)
+    np.testing.assert_allclose(fused.weights, average.weights, atol=1e-12)
+    assert np.linalg.eigvalsh(fused.cov - average.cov).min() > -1e-9
+    assert slack(fused, x, p).min() > -1e-12
+
+
 def test_parameters_that_do_not_go_together() -> None:
     x, p = np.zeros((2, 2)), np.stack([np.eye(2)] * 2)
-    text = "The 'mean' parameter 'optimal' needs bound 'optimal' and no weights. Got "
     with pytest.raises(ValueError) as caught:
         fuse(x, p, mean="optimal", bound="max_trace")
-    assert str(caught.value) == text + "bound 'max_trace'."
-    with pytest.raises(ValueError) as caught:
-        fuse(x, p, mean="optimal", weights=(0.5, 0.5))
-    assert str(caught.value) == text + "weights (0.5, 0.5)."
+    assert str(caught.value) == "The 'mean' parameter 'optimal' needs bound 'optimal'. Got bound 'max_trace'."
+    for mean in ("optimal", "diversity"):
+        with pytest.raises(ValueError) as caught:
+            fuse(x, p, mean=mean, weights=(0.5, 0.5))
+        assert str(caught.value) == f"The 'weights' parameter needs mean 'arithmetic'. Got mean '{mean}'."
     with pytest.raises(ValueError, match=r"The 'weights' parameter must hold one weight a source, 2. Got 3."):
         fuse(x, p, weights=(0.5, 0.25, 0.25))

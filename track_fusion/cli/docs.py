@@ -27,12 +27,13 @@ class Section(NamedTuple):
 
 @click.command(short_help="Write the generated documents and parameter files.")
 @click.option("--check", is_flag=True, help="Write nothing; exit with 1 when a file differs.")
+@click.option("--picture", is_flag=True, help="Draw doc/rules.png, too (needs matplotlib).")
 @click.option(
     "--root", default=SOURCE_TREE, type=click.Path(path_type=Path, file_okay=False), help="The source tree.",
 )  # fmt: skip
 @click.pass_context
-def docs(ctx: click.Context, check: bool, root: Path) -> None:
-    """Write doc/rules.md, config/fusion_centre.yaml and config/sensor_tracker.yaml in the source tree.
+def docs(ctx: click.Context, check: bool, picture: bool, root: Path) -> None:
+    """Write doc/rules.md, the table of doc/choosing-a-rule.md and the parameter files of config/ in the source tree.
 
     They are made from the registry of rules and the parameter dataclasses, and change with them. Needs ROS 2.
 
@@ -40,6 +41,11 @@ def docs(ctx: click.Context, check: bool, root: Path) -> None:
     """
     if not (root / "package.xml").is_file():
         raise click.UsageError(f"--root: {root} is no source tree of track_fusion, it has no package.xml.")
+    if picture:
+        from track_fusion.report.gallery import draw_rules
+
+        (root / "doc").mkdir(exist_ok=True)
+        click.echo(f"Drew {len(draw_rules(root / 'doc' / 'rules.png'))} rules in doc/rules.png")
     differing = []
     for name, text in generated().items():
         path = root / name
@@ -61,12 +67,25 @@ def generated() -> dict[str, str]:
     """Return the text of each generated file by its path in the source tree."""
     return {
         "doc/rules.md": rules_page(),
+        "doc/choosing-a-rule.md": choosing_page(),
         "config/fusion_centre.yaml": parameter_file("fusion_centre", fusion_centre_sections()),
         "config/sensor_tracker.yaml": parameter_file("sensor_tracker", sensor_tracker_sections()),
     }
 
 
-# The rules page.
+# The pages.
+
+_TABLE = re.compile(r"(<!-- begin: [^\n]*-->\n).*(<!-- end -->)", re.DOTALL)
+
+
+def choosing_page() -> str:
+    """Return doc/choosing-a-rule.md, written by hand but for its table of promises."""
+    from track_fusion.rules import RULES
+
+    rows = [(f"[`{r.key}`](rules.md#{r.key})", r.guarantee, r.caveat, r.cost, r.source) for r in RULES.values()]
+    table = _table(("rule", "promise", "when, or what breaks it", "cost", "source"), rows)
+    text = (SOURCE_TREE / "doc" / "choosing-a-rule.md").read_text(encoding="utf-8")
+    return _TABLE.sub(lambda found: f"{found[1]}{table}\n{found[2]}", text)
 
 
 def rules_page() -> str:

@@ -7,15 +7,15 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from track_fusion.densities.gaussian import merge
+from track_fusion.densities.mixture import Mixture, moments
+from track_fusion.densities.mixture_reduction import runnalls
 from track_fusion.filters import extended
 from track_fusion.filters.interacting_multiple_model import check_chain, mixing, reweighted
 from track_fusion.filters.iterated_corrector import GaussianUpdate
 from track_fusion.linalg import Array
 from track_fusion.models.base import Sensor, Transition
-from track_fusion.rules.base import Mixture
 
-#: (mixture (..., C), count) -> mixture of at most `count` components, as runnalls of densities/mixture_reduction.py
+#: (mixture (..., C), count) -> mixture of at most `count` components: those of densities/mixture_reduction.py
 Reduce = Callable[[Mixture, int], Mixture]
 
 
@@ -45,8 +45,7 @@ class MixtureModes:
     @property
     def moments(self) -> tuple[Array, Array]:
         """Mean (..., n) and covariance (..., n, n) over all modes and components."""
-        whole = self.marginal
-        return merge(whole.mean, whole.cov, whole.weight)
+        return moments(self.marginal)
 
 
 def mix(modes: MixtureModes, chain: Array) -> MixtureModes:
@@ -75,8 +74,8 @@ def predict(
     modes: MixtureModes,
     transitions: Sequence[Transition],
     chain: Array,
-    reduce: Reduce,
     count: int,
+    reduce: Reduce = runnalls,
     jump_first: bool = False,
 ) -> MixtureModes:
     """Predict one interval by extended Kalman filters, then reduce each mode to at most `count` components.
@@ -86,8 +85,8 @@ def predict(
     modes : MixtureModes           (..., M)
     transitions : M Transitions    one a mode
     chain : (M, M)                 chain[i, j] = probability of going from mode i to mode j
-    reduce : Reduce                Runnalls in Ahmed
     count : int                    components to keep in each mode
+    reduce : Reduce                Runnalls, as in Ahmed
     jump_first : bool              false: move by the old mode, then jump (Ahmed (57), (73)); true: jump, then move
 
     Notes         Exact, but for the linearisation, as long as nothing is reduced: C grows M-fold at each step.

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from track_fusion.densities.gaussian import merge
+from track_fusion.densities.log_domain import log_of, log_sum_exp, normalised
 from track_fusion.filters import extended
 from track_fusion.filters.iterated_corrector import GaussianUpdate
 from track_fusion.linalg import Array
@@ -133,9 +134,5 @@ def update(modes: Modes, z: Array, sensor: Sensor, one: GaussianUpdate = extende
 
 def reweighted(weight: Array, log_likelihood: Array) -> tuple[Array, Array]:
     """Multiply weights (..., M) by likelihoods: the new weights, sum one, and the log of what they summed to."""
-    with np.errstate(divide="ignore"):
-        joint = np.log(weight) + log_likelihood
-    top = joint.max(-1, keepdims=True)
-    scaled = np.exp(joint - top)
-    total = scaled.sum(-1, keepdims=True)
-    return scaled / total, np.asarray((np.log(total) + top)[..., 0])
+    joint = log_of(weight) + log_likelihood
+    return normalised(joint), log_sum_exp(joint)

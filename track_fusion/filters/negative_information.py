@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from track_fusion.densities.log_domain import log_of
+from track_fusion.densities.mixture import Mixture
 from track_fusion.linalg import Array, cholesky, inverse, matvec, outer, solve, symmetrise, transpose
 from track_fusion.models.detection import SoftmaxDetector
-from track_fusion.rules.base import Mixture
 
 LOG_2PI = float(np.log(2.0 * np.pi))
 #: Newton's iteration for the mode of a component: at most so many steps, each halved at most so often.
@@ -73,19 +74,16 @@ def update(
     log_mass, new_mean, new_cov, share = _products(
         mean, cov, detector, used, _normal_points(mean.shape[-1], samples, seed)
     )
-    with np.errstate(divide="ignore"):
-        log_weight = np.log(mixture.weight)[..., None] + np.log(chance[used]) + log_mass
+    log_weight = log_of(mixture.weight)[..., None] + np.log(chance[used]) + log_mass
     (*lead, count, classes), n = log_weight.shape, mean.shape[-1]
     flat = log_weight.reshape(*lead, count * classes)
     top = flat.max(-1, keepdims=True)
     weight = np.exp(flat - top)
     total = weight.sum(-1, keepdims=True)
-    with np.errstate(divide="ignore"):
-        before = np.log(mixture.weight.sum(-1))
     found = Mixture(
         weight / total, new_mean.reshape(*lead, count * classes, n), new_cov.reshape(*lead, count * classes, n, n)
     )
-    log_likelihood = (np.log(total) + top)[..., 0] - before
+    log_likelihood = (np.log(total) + top)[..., 0] - np.log(mixture.weight.sum(-1))
     return found, Evidence(np.asarray(log_likelihood), share.reshape(*lead, count * classes))
 
 

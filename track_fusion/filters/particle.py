@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from track_fusion.densities.log_domain import log_of, log_sum_exp
 from track_fusion.linalg import Array, cholesky, symmetrise, transpose
 from track_fusion.models.base import Sensor, Transition
 from track_fusion.random_streams import Generators, exponentials, normals, uniforms
@@ -43,13 +44,6 @@ class Particles:
     def weight(self) -> Array:
         """Weights (..., N)."""
         return np.exp(self.log_weight)
-
-
-def _log_sum(log_weight: Array) -> Array:
-    top = log_weight.max(-1, keepdims=True)
-    top = np.where(np.isfinite(top), top, 0.0)
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.log(np.exp(log_weight - top).sum(-1)) + top[..., 0])
 
 
 def from_gaussian(mean: Array, cov: Array, rng: Generators, count: int) -> Particles:
@@ -89,7 +83,7 @@ def moments(particles: Particles) -> tuple[Array, Array]:
 
 def effective_sample_size(particles: Particles) -> Array:
     """Return 1 / (sum of squared weights), between 1 and N: (...)."""
-    return np.asarray(np.exp(-_log_sum(2.0 * particles.log_weight)))
+    return np.asarray(np.exp(-log_sum_exp(2.0 * particles.log_weight)))
 
 
 def predict(particles: Particles, transition: Transition, rng: Generators) -> Particles:
@@ -127,7 +121,7 @@ def update(particles: Particles, z: Array, sensor: Sensor) -> tuple[Particles, A
     white = residual @ transpose(np.asarray(np.linalg.inv(lower), np.float64))
     scale = np.log(np.diagonal(lower)).sum() + 0.5 * LOG_2PI * len(lower)
     joint = particles.log_weight - 0.5 * (white**2).sum(-1) - scale
-    total = _log_sum(joint)
+    total = log_sum_exp(joint)
     return Particles(particles.points, joint - total[..., None]), total
 
 
@@ -139,8 +133,7 @@ def union(sets: Sequence[Particles], weights: Array) -> Particles:
     sets : K Particles, (..., N_i) each
     weights : (..., K)    non-negative, sum one
     """
-    with np.errstate(divide="ignore"):
-        share = np.log(weights)
+    share = log_of(weights)
     lead = np.broadcast_shapes(*(s.points.shape[:-2] for s in sets), weights.shape[:-1])
     points = [np.broadcast_to(s.points, (*lead, *s.points.shape[-2:])) for s in sets]
     logs = [np.broadcast_to(s.log_weight + share[..., i, None], (*lead, s.count)) for i, s in enumerate(sets)]

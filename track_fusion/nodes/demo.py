@@ -28,6 +28,8 @@ from track_fusion.nodes.recorder import Recorder, read_bag
 from track_fusion.report.picture import Line, draw
 from track_fusion.scenarios import Scenario, figures, get_scenario
 
+#: What the tracker nodes run: the rows of a scenario that start with this.
+NODE_FILTER = "kf-"
 #: A run over ROS that takes longer than this has hung.
 RUN_DEADLINE_S = 60.0
 #: Domains that Linux's default range of ephemeral ports leaves free.
@@ -79,10 +81,9 @@ def run_demo(demo: Demo, progress: Progress) -> dict[str, Any]:
     for rule in (None, *demo.rules):
         over_ros[rule or "alone"] = _over_ros(demo, rule, progress)
     scenario = demo.scenario
-    same = scenario.study(1, demo.seed, lambda share: None)
-    many = scenario.study(
-        demo.library_runs, demo.seed, lambda share: progress(f"library, {demo.library_runs} runs", share)
-    )
+    label = f"library, {demo.library_runs} runs"
+    same = scenario.study(1, demo.seed, lambda share: None, NODE_FILTER)
+    many = scenario.study(demo.library_runs, demo.seed, lambda share: progress(label, share), NODE_FILTER)
     result = _figures(demo, over_ros, same, many)
     (demo.out / "figures.json").write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
     _picture(demo)
@@ -183,7 +184,7 @@ def _figures(
 
     The standard error of one run is the spread of a run in the study.
     """
-    scenario, rows = demo.scenario, [f"kf-{name}" for name in over_ros]
+    scenario, rows = demo.scenario, [NODE_FILTER + name for name in over_ros]
     listed: list[dict[str, Any]] = []
     for row, measured in zip(rows, over_ros.values(), strict=True):
         for quantity in measured:

@@ -7,6 +7,7 @@ from typing import Literal, cast
 
 import numpy as np
 
+from track_fusion.densities.merging_weights import merging_weights
 from track_fusion.densities.upper_bound import Bound, bound_about, bound_anywhere
 from track_fusion.linalg import Array, outer
 from track_fusion.params import Params, param
@@ -30,11 +31,12 @@ class CovarianceUnionParams(Params):
     )
     mean: str = param(
         "arithmetic",
-        "x: the arithmetic mean of the tracks, or the one whose optimal bound is smallest",
-        choices=("arithmetic", "optimal"),
+        "x: the arithmetic mean of the tracks, at 'weights'; diversity: at the weights of the arithmetic average, "
+        "eq. (40); optimal: the one whose optimal bound is smallest",
+        choices=("arithmetic", "diversity", "optimal"),
     )
     weights: tuple[float, ...] = param(
-        (), "weights of the arithmetic mean, one a source, sum 1; none: equal", low=0.0, high=1.0, kind=float
+        (), "weights for mean arithmetic, one a source, sum 1; none: equal", low=0.0, high=1.0, kind=float
     )
 
 
@@ -54,13 +56,14 @@ def fuse(tracks: SourceTracks, params: CovarianceUnionParams) -> FusedTracks:
 
     Raises
     ------
-    ValueError     weights do not fit, or the optimal mean is asked for a bound that is not optimal
+    ValueError     weights do not fit or belong to another mean, or the optimal mean is asked for a bound that is not
+                   optimal
     LinAlgError    a covariance is singular
 
     Notes          There is no least upper bound in the Loewner order: the one of least determinant or trace is
                    taken. max_trace breaks the promise: with P1 = diag(1, 4) and P2 = diag(5, 1) at one mean it is
-                   P2, and the error variance of a right track 1 is 4 times the claim along the second axis. The optimal
-                   mean depends on the means in a way for which the promise holds track by track, given the estimates.
+                   P2, and the error variance of a right track 1 is 4 times the claim along the second axis. About a
+                   mean by diversity, or the optimal one, the promise holds for each track given the estimates.
                    Two tracks about the arithmetic mean have a closed form, O(n^3); more, or
                    the optimal mean, take some twelve steps of an interior point, O(K n^6) each.
     References     T. Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average
@@ -69,15 +72,20 @@ def fuse(tracks: SourceTracks, params: CovarianceUnionParams) -> FusedTracks:
     batch, (count, n) = tracks.mean.shape[:-2], tracks.mean.shape[-2:]
     means, covs = tracks.mean.reshape(-1, count, n), tracks.cov.reshape(-1, count, n, n)
     criterion = cast(Literal["det", "trace"], params.criterion)
+    if params.weights and params.mean != "arithmetic":
+        raise ValueError(f"The 'weights' parameter needs mean 'arithmetic'. Got mean {params.mean!r}.")
     if params.mean == "optimal":
-        if params.bound != "optimal" or params.weights:
-            wrong = f"bound {params.bound!r}" if params.bound != "optimal" else f"weights {params.weights}"
-            raise ValueError(f"The 'mean' parameter 'optimal' needs bound 'optimal' and no weights. Got {wrong}.")
+        if params.bound != "optimal":
+            raise ValueError(f"The 'mean' parameter 'optimal' needs bound 'optimal'. Got bound {params.bound!r}.")
         return _shaped(bound_anywhere(means, covs, criterion), batch, None)
-    share = check_weights(params.weights, count) if params.weights else np.full(count, 1.0 / count)
+    if params.mean == "diversity":
+        share = merging_weights(means, covs).weights
+    else:
+        equal = np.full(count, 1.0 / count)
+        share = np.broadcast_to(check_weights(params.weights, count) if params.weights else equal, means.shape[:2])
     origin = means[:, 0]
-    mean = origin + share @ (means - origin[:, None])
-    weights = np.broadcast_to(share, (*batch, count))
+    mean = origin + (share[..., None] * (means - origin[:, None])).sum(1)
+    weights = share.reshape(*batch, count)
     if params.bound == "optimal":
         return _shaped(bound_about(mean, means, covs, criterion), batch, weights)
     sides = covs + outer(mean[:, None] - means)
@@ -101,8 +109,7 @@ RULE = Rule(
     family="gaussian",
     arity="n_ary",
     guarantee="conservative",
-    caveat="with bound optimal and the arithmetic mean, if at least one track is; max_trace and min_trace promise "
-    "nothing",
+    caveat="with bound optimal and mean arithmetic, if at least one track is; max_trace and min_trace promise nothing",
     source="Li 2022 (7)-(9)",
     cost="n^3 for K = 2, else some twelve times K n^6",
     affine_equivariant="not with a trace, whether as criterion or as bound: it depends on the units of the axes",

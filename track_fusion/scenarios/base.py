@@ -5,16 +5,18 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from track_fusion.linalg import Array, matvec, transpose
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.models.base import Motion, Sensor
-from track_fusion.params import Params
+from track_fusion.params import Params, unknown_name_error
 from track_fusion.random_streams import stream
 from track_fusion.rules import Rule, SourceTracks
+
+T = TypeVar("T")
 
 #: A figure agrees within so many standard deviations of the difference.
 AGREEMENT_SIGMAS = 3.0
@@ -97,7 +99,8 @@ class Scenario:
     published_runs : int       Monte Carlo runs behind the published figures
     default_runs : int         runs for a quick look
     assumptions : tuple        values and readings that the paper does not give
-    study : callable           (runs, seed, progress) -> {figure name: Estimate}; progress(done share)
+    study : callable           (runs, seed, progress, only="") -> {figure name: Estimate}; progress(done share);
+                               only the rows whose names start with `only`
     tracking : Tracking | None what the ROS nodes run; None = library only
     rules : tuple              the rules it compares, with their parameters
     """
@@ -110,7 +113,7 @@ class Scenario:
     published_runs: int
     default_runs: int
     assumptions: tuple[str, ...]
-    study: Callable[[int, int, Callable[[float], None]], dict[str, Estimate]]
+    study: Callable[..., dict[str, Estimate]]
     tracking: Tracking | None
     rules: tuple[RuleChoice, ...]
 
@@ -136,6 +139,19 @@ def fuse_runs(rule: Rule, params: Params, mean: Array, cov: Array) -> tuple[Arra
         return matvec(transpose(fused.mean), mean.reshape(runs, -1)), fused.cov[:1]
     fused = rule.fuse(SourceTracks(mean, np.broadcast_to(cov, (runs, count, n, n))), params)
     return fused.mean, fused.cov
+
+
+def chosen(rows: Mapping[str, T], only: str) -> dict[str, T]:
+    """Return the rows whose names start with `only`.
+
+    Raises
+    ------
+    ParameterError    there is none; the message lists the rows
+    """
+    found = {name: row for name, row in rows.items() if name.startswith(only)}
+    if not found:
+        raise unknown_name_error(only, rows, "row")
+    return found
 
 
 def figures(scenario: Scenario, measured: Mapping[str, Estimate]) -> list[dict[str, Any]]:

@@ -15,7 +15,7 @@ from track_fusion.rules import RULES
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.naive import NaiveParams
-from track_fusion.scenarios.base import RuleChoice, Scenario, Tracking, fuse_runs
+from track_fusion.scenarios.base import RuleChoice, Scenario, Tracking, chosen, fuse_runs
 from track_fusion.scenarios.one_target import Quantity, Row, Sir, sir_alone, sir_fused
 from track_fusion.scenarios.one_target import squared_errors as collect
 from track_fusion.tracks import planar_layout
@@ -57,14 +57,14 @@ TRACKING = Tracking(
 )
 
 
-def study(runs: int, seed: int, progress: Callable[[float], None]) -> dict[str, Estimate]:
-    """Run every row of Table I over `runs` Monte Carlo runs.
+def study(runs: int, seed: int, progress: Callable[[float], None], only: str = "") -> dict[str, Estimate]:
+    """Run the rows of Table I whose names start with `only` over `runs` Monte Carlo runs.
 
     Returns
     -------
     {figure name: Estimate}, names like kf-alone/position_armse_m
     """
-    errors = squared_errors(range(runs), seed, progress, kalman_rows() | particle_rows())
+    errors = squared_errors(range(runs), seed, progress, chosen(kalman_rows() | particle_rows(), only))
     return {name: armse(squares) for name, squares in errors.items()}
 
 

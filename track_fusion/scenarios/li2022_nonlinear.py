@@ -13,7 +13,7 @@ from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.naive import NaiveParams
-from track_fusion.scenarios.base import RuleChoice, Scenario, Tracking
+from track_fusion.scenarios.base import RuleChoice, Scenario, Tracking, chosen
 from track_fusion.scenarios.one_target import (
     GaussianFilter,
     Quantity,
@@ -83,14 +83,14 @@ def rows() -> dict[str, Row]:
     return table
 
 
-def study(runs: int, seed: int, progress: Callable[[float], None]) -> dict[str, Estimate]:
-    """Run every row of Table II over `runs` Monte Carlo runs.
+def study(runs: int, seed: int, progress: Callable[[float], None], only: str = "") -> dict[str, Estimate]:
+    """Run the rows of Table II whose names start with `only` over `runs` Monte Carlo runs.
 
     Returns
     -------
     {figure name: Estimate}, names like ckf-alone/position_armse_m
     """
-    errors = squared_errors(TRACKING, rows(), QUANTITIES, range(runs), seed, progress)
+    errors = squared_errors(TRACKING, chosen(rows(), only), QUANTITIES, range(runs), seed, progress)
     return {name: armse(squares) for name, squares in errors.items()}
 
 

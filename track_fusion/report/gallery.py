@@ -1,0 +1,75 @@
+"""One picture of all rules on the same two tracks, at the four separations of Fig. 1 of Li 2022."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from track_fusion.linalg import Array
+from track_fusion.rules import RULES, Rule, SourceTracks
+
+#: The densities of Fig. 1 are not printed. This pair is assumed: trace-optimal covariance intersection gives it the
+#: paper's weight w1 = .3764.
+COVS = np.array([[[4.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, 2.4163]]])
+#: Distance of the means along x and half of it along y, from near to far: cases (a) to (d).
+SEPARATIONS = (0.5, 2.0, 4.5, 8.0)
+RULES_A_PANEL = 5
+COLORS = ("tab:blue", "tab:red", "tab:green", "tab:purple", "tab:orange")
+
+
+def drawn_rules() -> list[Rule]:
+    """Rules that two tracks are enough for, in the order of the registry."""
+    return [rule for rule in RULES.values() if not rule.needed(rule.params())]
+
+
+def two_tracks(separation: float) -> SourceTracks:
+    """Make the pair with its means so far apart."""
+    return SourceTracks(np.array([[0.0, 0.0], [separation, 0.5 * separation]]), COVS)
+
+
+def draw_rules(path: Path) -> list[str]:
+    """Draw every rule with its default parameters; return the keys drawn.
+
+    One column a separation; rows of at most five rules, one colour each; the two tracks dashed; ellipses of one
+    standard deviation.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    rules = drawn_rules()
+    groups = [rules[i : i + RULES_A_PANEL] for i in range(0, len(rules), RULES_A_PANEL)]
+    shape = len(groups), len(SEPARATIONS)
+    figure, panels = plt.subplots(*shape, figsize=(15, 2.9 * len(groups)), constrained_layout=True, squeeze=False)
+    for row, group in zip(panels, groups, strict=True):
+        for axes, separation in zip(row, SEPARATIONS, strict=True):
+            _panel(axes, group, separation)
+        row[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=9, frameon=False)
+    for axes, letter, separation in zip(panels[0], "abcd", SEPARATIONS, strict=True):
+        axes.set_title(f"({letter}) means {separation:g} apart along x")
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+    return [rule.key for rule in rules]
+
+
+def _panel(axes: Any, group: Sequence[Rule], separation: float) -> None:
+    tracks = two_tracks(separation)
+    for mean, cov in zip(tracks.mean, tracks.cov, strict=True):
+        axes.plot(*_ellipse(mean, cov), "--", color="0.4", lw=1.0)
+        axes.plot(*mean, "+", color="0.4")
+    for rule, color in zip(group, COLORS, strict=False):
+        fused = rule(tracks)
+        axes.plot(*_ellipse(fused.mean, fused.cov), color=color, lw=1.5, label=rule.key)
+        axes.plot(*fused.mean, ".", color=color)
+    axes.set_aspect("equal", "datalim")
+    axes.tick_params(labelsize=7)
+
+
+def _ellipse(mean: Array, cov: Array) -> Array:
+    """Points of the one-sigma ellipse, (2, 73)."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 73)
+    return np.asarray(mean[:, None] + np.linalg.cholesky(cov) @ np.stack([np.cos(angle), np.sin(angle)]))
