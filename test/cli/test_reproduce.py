@@ -27,7 +27,7 @@ def coin(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     """Register two scenarios that take no time, and return the list of (runs, seed) they were asked for."""
     asked: list[tuple[int, int]] = []
 
-    def study(runs: int, seed: int, progress: Callable[[float], None]) -> dict[str, Estimate]:
+    def study(runs: int, seed: int, progress: Callable[[float], None], only: str = "") -> dict[str, Estimate]:
         asked.append((runs, seed))
         progress(1.0)
         return {

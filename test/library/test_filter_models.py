@@ -212,6 +212,7 @@ def test_bearing_residuals_are_the_short_way_round(bearing, other):
 def test_small_angles_are_wrapped_without_loss():
     assert wrap_angle(np.array(1e-20)) == 1e-20
     assert wrap_angle(np.array(np.pi)) == -np.pi
+    assert wrap_angle(np.nextafter(-np.pi, -4.0)) == -np.pi
 
 
 def test_a_linear_sensor_wraps_angular_axes():

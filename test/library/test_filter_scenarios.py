@@ -69,3 +69,11 @@ def test_particle_rows_do_not_depend_on_the_batch(module):
         alone = row.estimates(Sample(0, range(1, 2), [z[1:2] for z in sample.seen]))
         for whole, one in zip(together, alone, strict=False):
             np.testing.assert_allclose(one[0], whole[1], rtol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize("module", [li2022_linear, li2022_nonlinear])
+def test_rows_are_chosen_by_the_beginning_of_their_names(module):
+    found = module.study(2, 0, lambda share: None, "sir-ic")
+    assert list(found) == [f"sir-ic/{quantity}" for quantity in module.QUANTITIES]
+    with pytest.raises(ValueError, match="Unknown row 'sir-ci'. Did you mean 'sir-ic'"):
+        module.study(2, 0, lambda share: None, "sir-ci")

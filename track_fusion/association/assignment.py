@@ -75,7 +75,9 @@ def _sparse(row: Indices, col: Indices, cost: Array, miss: float, rows: int, col
     private = np.arange(rows)
     weight = np.concatenate([cost, np.full(rows, miss)])
     weight += 1.0 - weight.min()  # a zero would read as no edge
-    graph = coo_array((weight, (np.append(row, private), np.append(col, cols + private))), shape=(rows, cols + rows))
+    # SciPy 1.11 takes 32-bit indices only.
+    at = np.append(row, private).astype(np.int32), np.append(col, cols + private).astype(np.int32)
+    graph = coo_array((weight, at), shape=(rows, cols + rows))
     return np.asarray(min_weight_full_bipartite_matching(graph.tocsr())[1], np.intp)
 
 

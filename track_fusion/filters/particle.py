@@ -75,10 +75,10 @@ def moments(particles: Particles) -> tuple[Array, Array]:
     The covariance is that of the weighted samples; it is singular when n or fewer of them carry all weight.
     """
     origin = particles.points[..., :1, :]
-    offset, weight = particles.points - origin, particles.weight[..., None]
-    shift = (weight * offset).sum(-2)
-    centred = offset - shift[..., None, :]
-    return origin[..., 0, :] + shift, symmetrise(transpose(weight * centred) @ centred)
+    offset, weight = particles.points - origin, particles.weight
+    shift = weight[..., None, :] @ offset
+    offset -= shift
+    return (origin + shift)[..., 0, :], symmetrise(transpose(weight[..., None] * offset) @ offset)
 
 
 def effective_sample_size(particles: Particles) -> Array:
@@ -142,7 +142,11 @@ def union(sets: Sequence[Particles], weights: Array) -> Particles:
 
 def take(particles: Particles, index: NDArray[np.intp]) -> Particles:
     """Pick particles (..., M) by index, with equal weights."""
-    return Particles(np.take_along_axis(particles.points, index[..., None], -2), _even(index.shape))
+    *lead, count, n = particles.points.shape
+    sets = int(np.prod(lead))
+    rows = index.reshape(sets, index.shape[-1]) + count * np.arange(sets)[:, None]
+    points = particles.points.reshape(sets * count, n)[rows]
+    return Particles(points.reshape(*index.shape, n), _even(index.shape))
 
 
 def resample_multinomial(particles: Particles, rng: Generators, count: int | None = None) -> Particles:

@@ -16,15 +16,22 @@ SHORTEST_M = 1e-100
 
 
 def wrap_angle(angle: Array) -> Array:
-    """Bring angles in radians to [-pi, pi)."""
-    turned = np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)
-    return np.where((angle >= -np.pi) & (angle < np.pi), angle, turned)  # leaves small angles exact
+    """Bring angles in radians to [-pi, pi); those that lie there stay as they are, to the last digit."""
+    angle = np.asarray(angle)
+    outside = (angle < -np.pi) | (angle >= np.pi)
+    if not outside.any():
+        return angle
+    turned = (angle + np.pi) % (2.0 * np.pi) - np.pi
+    turned = np.where(turned < np.pi, turned, -np.pi)  # the remainder of a tiny negative number is 2 pi itself
+    return np.where(outside, turned, angle)
 
 
 def wrapped_residual(z: Array, expected: Array, angular: NDArray[np.bool_]) -> Array:
     """Return z - expected, (..., m), where `angular` (m,) wrapped to [-pi, pi)."""
     residual = np.asarray(z - expected)
-    return np.where(angular, wrap_angle(residual), residual) if angular.any() else residual
+    for i in np.flatnonzero(angular):
+        residual[..., i] = wrap_angle(residual[..., i])
+    return residual
 
 
 @dataclasses.dataclass(frozen=True)
