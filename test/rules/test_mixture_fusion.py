@@ -17,7 +17,7 @@ from track_fusion.densities.mixture_divergence import grid, kl_on_grid
 from track_fusion.densities.mixture_sampling import Weighted, single_shot_em
 from track_fusion.linalg import Array
 from track_fusion.params import from_dict
-from track_fusion.rules import FusedTracks, SourceTracks, get_rule
+from track_fusion.rules import FusedTracks, SourceTracks, get_rule, mixture_common
 
 
 def run(key: str, tracks: SourceTracks, **values: Any) -> FusedTracks:
@@ -284,6 +284,35 @@ def test_the_seed_decides(key: str) -> None:
     np.testing.assert_array_equal(fused(), fused(seed=0))
     np.testing.assert_array_equal(fused(seed=5), fused(seed=np.random.default_rng(5)))
     assert np.abs(fused(seed=0) - fused(seed=1)).max() > 1e-6
+
+
+@pytest.mark.parametrize(
+    ("key", "values"),
+    [
+        ("mixture_exact", {}),
+        ("mixture_wep", {}),
+        ("geometric_mean_sampling", {}),
+        ("harmonic_mean", {"method": "sampling"}),
+    ],
+)
+def test_large_batches_are_cut_into_pieces_that_draw_the_same_numbers(
+    key: str, values: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(10)
+    part = draw(rng, 2, 3, 3)
+    common = Mixture(part.weight[:, :, 0], part.mean[:, :, 0], part.cov[:, :, 0] + 60 * np.eye(2))
+    tracks = dataclasses.replace(as_tracks(part), extras={"common": common})
+    whole = run(key, tracks, **values)
+    monkeypatch.setattr(mixture_common, "POINTS", 1)
+    generator = np.random.default_rng(0)
+    cut = run(key, dataclasses.replace(tracks, extras={"common": common, "seed": generator}), **values)
+    np.testing.assert_allclose(cut.mean, whole.mean, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(cut.cov, whole.cov, rtol=1e-9, atol=1e-9)
+    for name in ("converged", "ess", "log_eta"):
+        np.testing.assert_allclose(cut.info.get(name, 0), whole.info.get(name, 0), rtol=1e-8, atol=1e-8)
+    assert cut.mixture is not None
+    assert cut.mixture.weight.shape[:2] == (2, 3)
+    assert generator.random() != np.random.default_rng(0).random()  # a generator moves on
 
 
 @pytest.mark.parametrize("reduction", ["runnalls", "salmond", "cap"])

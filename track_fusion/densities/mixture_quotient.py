@@ -7,7 +7,7 @@ sum over z = (v, r) of w_z N(x; m_z, P_z) / u(x), a mixture of non-Gaussian mixa
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -202,13 +202,39 @@ def laplace(quotient: Quotient) -> Laplace:
     """
     weight, centre, cov = quotient.numerator
     lower = cholesky(cov)
-    y, damping = np.zeros(centre.shape), np.ones(centre.shape[:-1])
+    y, value, hessian, done = _climb(
+        quotient, centre, lower, np.zeros(centre.shape), np.ones(centre.shape[:-1]), MAX_NEWTON
+    )
+    curvature, axes = np.linalg.eigh(hessian)
+    peaked = done & (curvature[..., 0] > FLOOR)
+    curvature = np.where(peaked[..., None], curvature, 1.0)
+    root = lower @ axes / np.sqrt(curvature)[..., None, :]
+    log_moment = weight - value - 0.5 * np.log(curvature).sum(-1)
+    return Laplace(log_moment, centre + matvec(lower, y), symmetrise(root @ transpose(root)), done)
+
+
+def _climb(
+    quotient: Quotient, centre: Array, lower: Array, y: Array, damping: Array, steps: int
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Climb to the modes from y (..., M, n); return them, the cost and its Hessian there, and which converged.
+
+    Each mixand takes its own steps and stops when it is done. Once half are, the others go on by themselves.
+    """
     value, gradient, hessian = _cost(quotient, centre, lower, y)
     done = np.zeros(damping.shape, bool)
-    for _ in range(MAX_NEWTON):
+    for taken in range(steps):
         step, fall = _newton_step(gradient, hessian)
         done = fall < DECREMENT
-        if done.all():
+        left = int((~done).sum(-1).max(initial=0))
+        if left == 0:
+            break
+        if left <= centre.shape[-2] // 2:
+            at = np.argsort(done, axis=-1, kind="stable")[..., :left]
+            some = _take(centre, at), _take(lower, at), _take(y, at), _take(damping, at)
+            rest = _climb(quotient, *some, steps - taken)
+            whole: tuple[NDArray[Any], ...] = (y, value, hessian, done)
+            for array, part in zip(whole, rest, strict=True):
+                np.put_along_axis(array, _index(array, at), part, at.ndim - 1)
             break
         trial = y + np.where(done, 0.0, damping)[..., None] * step
         new_value, new_gradient, new_hessian = _cost(quotient, centre, lower, trial)
@@ -217,12 +243,15 @@ def laplace(quotient: Quotient) -> Laplace:
         gradient = np.where(better[..., None], new_gradient, gradient)
         hessian = np.where(better[..., None, None], new_hessian, hessian)
         damping = np.where(better, np.minimum(2.0 * damping, 1.0), 0.5 * damping)
-    curvature, axes = np.linalg.eigh(hessian)
-    peaked = done & (curvature[..., 0] > FLOOR)
-    curvature = np.where(peaked[..., None], curvature, 1.0)
-    root = lower @ axes / np.sqrt(curvature)[..., None, :]
-    log_moment = weight - value - 0.5 * np.log(curvature).sum(-1)
-    return Laplace(log_moment, centre + matvec(lower, y), symmetrise(root @ transpose(root)), done)
+    return y, value, hessian, done
+
+
+def _index(array: NDArray[Any], at: NDArray[np.intp]) -> NDArray[np.intp]:
+    return at.reshape(*at.shape, *(1,) * (array.ndim - at.ndim))
+
+
+def _take(array: Array, at: NDArray[np.intp]) -> Array:
+    return np.take_along_axis(array, _index(array, at), at.ndim - 1)
 
 
 def _cost(quotient: Quotient, centre: Array, lower: Array, y: Array) -> tuple[Array, Array, Array]:

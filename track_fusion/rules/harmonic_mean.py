@@ -16,7 +16,7 @@ from track_fusion.linalg import Array, matvec, outer, transpose
 from track_fusion.optimise import Derivatives, Solution, minimise_on_interval
 from track_fusion.params import param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
-from track_fusion.rules.mixture_common import ReductionParams, Step, fold_mixtures, seeded
+from track_fusion.rules.mixture_common import Generators, ReductionParams, Step, fold_mixtures, fuse_sampled
 from track_fusion.rules.pairwise import PairFusion, fold, share_of_first
 
 
@@ -84,7 +84,9 @@ def fuse(tracks: SourceTracks, params: HarmonicMeanParams) -> FusedTracks:
         raise ValueError(f"The 'weights' parameter needs criterion 'given'. Got criterion {params.criterion!r}.")
     given = check_weights(params.weights, tracks.count) if params.criterion == "given" else None
     if params.method == "sampling":
-        return _fuse_by_sampling(tracks, params, given)
+        return fuse_sampled(
+            tracks, tracks.count * params.samples, lambda piece, rngs: _fuse_by_sampling(piece, params, given, rngs)
+        )
 
     def kernel(x1: Array, p1: Array, x2: Array, p2: Array, share: float | None) -> PairFusion:
         pair = Pair.of(p1, p2)
@@ -94,9 +96,10 @@ def fuse(tracks: SourceTracks, params: HarmonicMeanParams) -> FusedTracks:
     return fold(tracks, kernel, given)
 
 
-def _fuse_by_sampling(tracks: SourceTracks, params: HarmonicMeanParams, given: Array | None) -> FusedTracks:
+def _fuse_by_sampling(
+    tracks: SourceTracks, params: HarmonicMeanParams, given: Array | None, rngs: Generators
+) -> FusedTracks:
     """Fuse by HMD-S; the weights (77) are those of the Gaussians with the densities' moments."""
-    rng = seeded(tracks)
 
     def step(first: Mixture, second: Mixture, k: int) -> Step:
         lead, n = first.weight.shape[:-1], first.mean.shape[-1]
@@ -107,7 +110,7 @@ def _fuse_by_sampling(tracks: SourceTracks, params: HarmonicMeanParams, given: A
         omega = found.weights.reshape(lead)
         parts = stacked(first, second)
         weights = np.stack([omega, 1.0 - omega], -1)
-        drawn = sample_mean_density(parts, weights, "harmonic", rng, params.samples, params.inflation)
+        drawn = sample_mean_density(parts, weights, "harmonic", rngs[k - 1], params.samples, params.inflation)
         fused = fit_mean_density(drawn, product(LogMixture.of(first), LogMixture.of(second)))
         if params.inflation == 1.0:
             fused = chosen((omega == 1.0) | same(first, second), first, chosen(omega == 0.0, second, fused))

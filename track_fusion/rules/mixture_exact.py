@@ -36,7 +36,7 @@ from track_fusion.densities.mixture_sampling import Weighted, weighted_em
 from track_fusion.linalg import Array, is_positive_definite
 from track_fusion.params import param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.mixture_common import ReductionParams, Step, fold_mixtures, seeded
+from track_fusion.rules.mixture_common import Generators, ReductionParams, Step, fold_mixtures, fuse_sampled
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,13 +101,19 @@ def fuse(tracks: SourceTracks, params: MixtureExactParams) -> FusedTracks:
     References     N. R. Ahmed, Decentralized Gaussian Mixture Fusion through Unified Quotient Approximations,
                    eqs. (6), (13), (22), (26)-(37), (46)-(56), Algorithms 2 to 5.
     """
-    common, rng = common_information(tracks), seeded(tracks)
-
-    def step(first: Mixture, second: Mixture, k: int) -> Step:
-        return _fuse_pair(first, second, common[k - 1], params, rng)
-
+    common_information(tracks)  # says what is wrong before the batch is cut
     start = {"converged": True, "ess": 1.0, "log_eta": 0.0, "pruned": 0.0, "skipped": 0}
-    return fold_mixtures(tracks, params, step, start)
+
+    def fuse_piece(piece: SourceTracks, rngs: Generators) -> FusedTracks:
+        shared = common_information(piece)
+
+        def step(first: Mixture, second: Mixture, k: int) -> Step:
+            return _fuse_pair(first, second, shared[k - 1], params, rngs[k - 1])
+
+        return fold_mixtures(piece, params, step, start)
+
+    points = max(params.samples, params.largest_product(tracks) * params.mixand_samples)
+    return fuse_sampled(tracks, points, fuse_piece)
 
 
 def common_information(tracks: SourceTracks) -> list[Mixture]:

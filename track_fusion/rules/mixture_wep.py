@@ -31,10 +31,11 @@ from track_fusion.params import param
 from track_fusion.rules import covariance_intersection
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
 from track_fusion.rules.mixture_common import (
+    Generators,
     ReductionParams,
     Step,
     fold_mixtures,
-    seeded,
+    fuse_sampled,
 )
 from track_fusion.rules.pairwise import share_of_first
 
@@ -107,14 +108,17 @@ def fuse(tracks: SourceTracks, params: MixtureWepParams) -> FusedTracks:
     if params.weights and params.criterion != "given":
         raise ValueError(f"The 'weights' parameter needs criterion 'given'. Got criterion {params.criterion!r}.")
     given = check_weights(params.weights, tracks.count) if params.criterion == "given" else None
-    rng = seeded(tracks)
-
-    def step(first: Mixture, second: Mixture, k: int) -> Step:
-        share = None if given is None else share_of_first(given, k)
-        return _fuse_pair(first, second, params, rng, share)
-
     start = {"converged": True, "iterations": 0, "ess": 1.0, "log_eta": 0.0, "pruned": 0.0}
-    return fold_mixtures(tracks, params, step, start)
+
+    def fuse_piece(piece: SourceTracks, rngs: Generators) -> FusedTracks:
+        def step(first: Mixture, second: Mixture, k: int) -> Step:
+            share = None if given is None else share_of_first(given, k)
+            return _fuse_pair(first, second, params, rngs[k - 1], share)
+
+        return fold_mixtures(piece, params, step, start)
+
+    points = max(params.samples, params.largest_product(tracks) * params.mixand_samples)
+    return fuse_sampled(tracks, points, fuse_piece)
 
 
 def _fuse_pair(
