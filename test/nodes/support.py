@@ -21,7 +21,7 @@ from track_fusion.tracks import TrackBatch, planar_layout
 SECOND_NS = 1_000_000_000
 AXES = ("x", "y", "vx", "vy")
 START_S = 60.0  # processes start slowly when the machine is busy
-STEP_S = 10.0  # far above what anything awaited here takes
+STEP_S = 60.0  # far above what anything awaited here takes, on a busy machine too
 
 #: A centre in simulated time that runs a step only when all its sources are there: no wall clock in the result.
 PATIENT = {
