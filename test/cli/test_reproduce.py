@@ -9,14 +9,15 @@ import re
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import pytest
 from cli.runner import DEADLINE_S, ROOT, refusal, run, strict_json
 
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.scenarios import SCENARIOS, Scenario
+from track_fusion.scenarios import SCENARIOS, Samples, Scenario
 
 VERDICTS = {"agrees", "ordering only", "does not reproduce", "not given"}
 NAME = re.compile(r"^[a-z0-9]+-[a-z0-9_]+(@[a-z0-9_]+)?/[a-z0-9_]+_[a-z0-9]+$")
@@ -27,9 +28,13 @@ def coin(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     """Register two scenarios that take no time, and return the list of (runs, seed) they were asked for."""
     asked: list[tuple[int, int]] = []
 
-    def study(runs: int, seed: int, progress: Callable[[float], None], only: str = "") -> dict[str, Estimate]:
-        asked.append((runs, seed))
+    def sample(runs: Sequence[int], seed: int, progress: Callable[[float], None], only: str = "") -> Samples:
+        asked.append((len(runs), seed))
         progress(1.0)
+        return {"runs": np.zeros(len(runs))}
+
+    def figures(samples: Samples) -> dict[str, Estimate]:
+        runs = len(samples["runs"])
         return {
             "kf-alone/error_m": Estimate(1.0, 0.01, runs),
             "kf-ic/error_m": Estimate(9.0, 0.01, runs),
@@ -37,7 +42,7 @@ def coin(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
         }
 
     scenario = Scenario("coin", "A coin", "Nobody", "nothing", {"kf-alone/error_m": 1.01, "kf-ic/error_m": 0.5}, 10, 30,
-                        ("it is fair",), study, None, ())  # fmt: skip
+                        30, ("it is fair",), sample, figures, lambda samples: [])  # fmt: skip
     monkeypatch.setitem(SCENARIOS, "coin", scenario)
     monkeypatch.setitem(SCENARIOS, "dice", dataclasses.replace(scenario, key="dice", default_runs=60))
     return asked

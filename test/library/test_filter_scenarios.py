@@ -73,7 +73,7 @@ def test_particle_rows_do_not_depend_on_the_batch(module):
 
 @pytest.mark.parametrize("module", [li2022_linear, li2022_nonlinear])
 def test_rows_are_chosen_by_the_beginning_of_their_names(module):
-    found = module.study(2, 0, lambda share: None, "sir-ic")
+    found = module.SCENARIO.study(2, 0, only="sir-ic")
     assert list(found) == [f"sir-ic/{quantity}" for quantity in module.QUANTITIES]
     with pytest.raises(ValueError, match="Unknown row 'sir-ci'. Did you mean 'sir-ic'"):
-        module.study(2, 0, lambda share: None, "sir-ci")
+        module.SCENARIO.study(2, 0, only="sir-ci")

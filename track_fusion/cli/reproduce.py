@@ -58,7 +58,7 @@ def _run(scenario: Scenario, runs: int, seed: int, only: str) -> dict[str, Any]:
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     from track_fusion.cli.output import console
-    from track_fusion.scenarios import figures
+    from track_fusion.scenarios import judged_figures
 
     err = console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
@@ -66,7 +66,7 @@ def _run(scenario: Scenario, runs: int, seed: int, only: str) -> dict[str, Any]:
     task = bar.add_task(f"{scenario.key}, {runs} runs", total=1.0)
     with bar if err.is_terminal else contextlib.nullcontext():
         measured = scenario.study(runs, seed, lambda share: bar.update(task, completed=share), only)
-    return {"scenario": scenario.key, "runs": runs, "seed": seed, "figures": figures(scenario, measured)}
+    return {"scenario": scenario.key, "runs": runs, "seed": seed, "figures": judged_figures(scenario, measured)}
 
 
 def _print_tables(scenario: Scenario, result: dict[str, Any], took_s: float) -> None:

@@ -17,6 +17,28 @@ class Estimate:
     standard_error: float
     runs: int
 
+    @classmethod
+    def exact(cls, value: float) -> Estimate:
+        """Make a figure that nothing random goes into."""
+        return cls(float(value), 0.0, 1)
+
+    @classmethod
+    def mean(cls, values: Array) -> Estimate:
+        """Average over runs, (R,)."""
+        values = np.asarray(values, float)
+        error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else float("nan")
+        return cls(float(values.mean()), float(error), len(values))
+
+    @classmethod
+    def median(cls, values: Array) -> Estimate:
+        """Median over runs, (R,); standard error: half the distance of the order statistics one binomial sd away."""
+        values, runs = np.sort(np.asarray(values, float)), len(values)
+        if runs < 2:
+            return cls(float(np.median(values)), float("nan"), runs)
+        ranks = np.clip([(runs - np.sqrt(runs)) / 2, (runs + np.sqrt(runs)) / 2], 0, runs - 1)
+        low, high = np.interp(ranks, np.arange(runs), values)
+        return cls(float(np.median(values)), float(0.5 * (high - low)), runs)
+
     def spread(self, runs: int) -> float:
         """Standard deviation that the figure would have in a study of so many runs."""
         return float(self.standard_error * np.sqrt(self.runs / runs))

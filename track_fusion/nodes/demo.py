@@ -26,7 +26,7 @@ from track_fusion.nodes.bringup import Nodes, local_environment, running, start_
 from track_fusion.nodes.managed import Fault, qos
 from track_fusion.nodes.recorder import Recorder, read_bag
 from track_fusion.report.picture import Line, draw
-from track_fusion.scenarios import Scenario, figures, get_scenario
+from track_fusion.scenarios import Scenario, get_scenario, judged_figures
 
 #: What the tracker nodes run: the rows of a scenario that start with this.
 NODE_FILTER = "kf-"
@@ -191,9 +191,9 @@ def _figures(
             name = f"{row}/{quantity}"
             for path, value in (("ros", measured[quantity]), ("library", same[name].value)):
                 single = Estimate(value, many[name].spread(1), 1)
-                (figure,) = figures(scenario, {name: single})
+                (figure,) = judged_figures(scenario, {name: single})
                 listed.append({**figure, "name": f"{path}/{name}"})
-    for figure in figures(scenario, many):
+    for figure in judged_figures(scenario, many):
         name = figure["name"]
         row, _, quantity = name.rpartition("/")
         variant = f"{row},{demo.library_runs}-runs" if "@" in row else f"{row}@{demo.library_runs}-runs"

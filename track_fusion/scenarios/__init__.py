@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from track_fusion.params import unknown_name_error
 from track_fusion.scenarios import li2022_linear, li2022_nonlinear
-from track_fusion.scenarios.base import RuleChoice, Scenario, Tracking, figures
+from track_fusion.scenarios.base import Claim, RuleChoice, Samples, Scenario, Tracking, judged_claims, judged_figures
 
 SCENARIOS: dict[str, Scenario] = {module.SCENARIO.key: module.SCENARIO for module in (li2022_linear, li2022_nonlinear)}
 
@@ -21,4 +21,14 @@ def get_scenario(key: str) -> Scenario:
     return SCENARIOS[key]
 
 
-__all__ = ["SCENARIOS", "RuleChoice", "Scenario", "Tracking", "figures", "get_scenario"]
+__all__ = [
+    "SCENARIOS",
+    "Claim",
+    "RuleChoice",
+    "Samples",
+    "Scenario",
+    "Tracking",
+    "get_scenario",
+    "judged_claims",
+    "judged_figures",
+]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
+from decimal import Decimal
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,6 +15,7 @@ from track_fusion.metrics.accuracy import Estimate
 from track_fusion.models.base import Motion, Sensor
 from track_fusion.params import Params, unknown_name_error
 from track_fusion.random_streams import stream
+from track_fusion.report.chart import Chart
 from track_fusion.rules import Rule, SourceTracks
 
 T = TypeVar("T")
@@ -87,22 +89,64 @@ class RuleChoice:
         return f"{self.key}@{self.variant}" if self.variant else self.key
 
 
+#: Measurements of R Monte Carlo runs by name, (R, ...) each: what runs are joined by.
+Samples = dict[str, Array]
+Progress = Callable[[float], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Claim:
+    """Something a paper claims that is no single figure, and how it is judged.
+
+    Attributes
+    ----------
+    text, source : str      the claim in our words; where it stands
+    needs : tuple of str    names of the figures that decide it
+    holds : callable        their Estimates, in this order -> whether the claim is true of them
+    """
+
+    text: str
+    source: str
+    needs: tuple[str, ...]
+    holds: Callable[..., bool]
+
+    @classmethod
+    def order(cls, text: str, source: str, *needs: str) -> Claim:
+        """Claim that the figures ascend strictly."""
+
+        def holds(*estimates: Estimate) -> bool:
+            values = [e.value for e in estimates]
+            return all(a < b for a, b in zip(values, values[1:], strict=False))
+
+        return cls(text, source, needs, holds)
+
+
 @dataclasses.dataclass(frozen=True)
 class Scenario:
     """A published scenario.
+
+    A study draws Monte Carlo runs (`sample`), joins them along their first axes, and makes figures, claims and charts
+    of them; so runs can be worked on in pieces, by several processes, and kept.
 
     Attributes
     ----------
     key, title, paper          identification
     shows : str                what one learns from it
-    published : mapping        figure name -> published value
+    published : mapping        figure name -> value as printed
     published_runs : int       Monte Carlo runs behind the published figures
-    default_runs : int         runs for a quick look
+    default_runs : int         runs for a quick look; 1 where nothing is random
+    publication_runs : int     runs for figures to be quoted
     assumptions : tuple        values and readings that the paper does not give
-    study : callable           (runs, seed, progress, only="") -> {figure name: Estimate}; progress(done share);
-                               only the rows whose names start with `only`
+    sample : callable          (runs, seed, progress, only) -> Samples of these run indices; `only` = beginning of the
+                               names of the rows wanted; progress(done share). No run depends on the others
+    figures : callable         Samples -> {figure name: Estimate}
+    charts : callable          Samples -> list of Chart
+    claims : tuple of Claim
+    piece : int                so many runs are worked on at once
     tracking : Tracking | None what the ROS nodes run; None = library only
     rules : tuple              the rules it compares, with their parameters
+    compare : callable | None  (rules, runs, seed, progress) -> Samples, (R,) each, named as figures are: one number a
+                               run for any rules; None = the scenario fuses no tracks
     """
 
     key: str
@@ -112,10 +156,27 @@ class Scenario:
     published: Mapping[str, float]
     published_runs: int
     default_runs: int
+    publication_runs: int
     assumptions: tuple[str, ...]
-    study: Callable[..., dict[str, Estimate]]
-    tracking: Tracking | None
-    rules: tuple[RuleChoice, ...]
+    sample: Callable[[Sequence[int], int, Progress, str], Samples]
+    figures: Callable[[Samples], dict[str, Estimate]]
+    charts: Callable[[Samples], list[Chart]]
+    claims: tuple[Claim, ...] = ()
+    piece: int = 100
+    tracking: Tracking | None = None
+    rules: tuple[RuleChoice, ...] = ()
+    compare: Callable[[Sequence[RuleChoice], Sequence[int], int, Progress], Samples] | None = None
+
+    @property
+    def random(self) -> bool:
+        """Whether more runs tell more."""
+        return self.default_runs > 1
+
+    def study(
+        self, runs: int, seed: int, progress: Progress = lambda share: None, only: str = ""
+    ) -> dict[str, Estimate]:
+        """Measure the figures whose names start with `only` over `runs` Monte Carlo runs, at once."""
+        return self.figures(self.sample(range(runs), seed, progress, only))
 
 
 def fuse_runs(rule: Rule, params: Params, mean: Array, cov: Array) -> tuple[Array, Array]:
@@ -154,7 +215,7 @@ def chosen(rows: Mapping[str, T], only: str) -> dict[str, T]:
     return found
 
 
-def figures(scenario: Scenario, measured: Mapping[str, Estimate]) -> list[dict[str, Any]]:
+def judged_figures(scenario: Scenario, measured: Mapping[str, Estimate]) -> list[dict[str, Any]]:
     """Set measured beside published, one entry a figure: name, value, standard_error, published, verdict."""
     return [
         {
@@ -168,23 +229,46 @@ def figures(scenario: Scenario, measured: Mapping[str, Estimate]) -> list[dict[s
     ]
 
 
+def judged_claims(scenario: Scenario, measured: Mapping[str, Estimate]) -> list[dict[str, Any]]:
+    """Judge the claims whose figures were measured: claim, source, verdict, evidence (the figures)."""
+    return [
+        {
+            "claim": claim.text,
+            "source": claim.source,
+            "verdict": "agrees" if claim.holds(*(measured[n] for n in claim.needs)) else "does not reproduce",
+            "evidence": {n: measured[n].value for n in claim.needs},
+        }
+        for claim in scenario.claims
+        if all(name in measured for name in claim.needs)
+    ]
+
+
 def verdict(scenario: Scenario, name: str, measured: Mapping[str, Estimate]) -> str:
     """Judge one figure.
 
     Returns
     -------
     "agrees" (the difference is within 3 standard deviations, Monte Carlo error here and spread of one
-    table of the paper's own run count together), "ordering only" (it stands to every other row of its
-    table as published), "does not reproduce" or "not given"
+    table of the paper's own run count together, and the rounding of the print), "ordering only" (it stands to every
+    other row of its table as published), "does not reproduce" or "not given"
     """
     published, estimate = scenario.published.get(name), measured[name]
     if published is None or math.isnan(estimate.standard_error):
         return "not given"
     error = math.hypot(estimate.standard_error, estimate.spread(scenario.published_runs))
-    if abs(estimate.value - published) <= AGREEMENT_SIGMAS * error:
+    if abs(estimate.value - published) <= AGREEMENT_SIGMAS * error + rounding(published):
         return "agrees"
     quantity = name.rpartition("/")[2]
     rows = [n for n in measured if n.endswith(f"/{quantity}") and scenario.published.get(n, published) != published]
     # A tie here where the paper has none is not its order; a tie of the paper orders nothing.
     kept = all((estimate.value - measured[n].value) * (published - scenario.published[n]) > 0 for n in rows)
     return "ordering only" if rows and kept else "does not reproduce"
+
+
+def rounding(published: float) -> float:
+    """Half a unit of the last digit with which a number is written down here; an int counts as exact."""
+    if isinstance(published, int):
+        return 0.0
+    exponent = Decimal(repr(published)).as_tuple().exponent
+    assert isinstance(exponent, int)
+    return 0.5 * 10.0**exponent

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -15,8 +15,8 @@ from track_fusion.rules import RULES
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.naive import NaiveParams
-from track_fusion.scenarios.base import RuleChoice, Scenario, Tracking, chosen, fuse_runs
-from track_fusion.scenarios.one_target import Quantity, Row, Sir, sir_alone, sir_fused
+from track_fusion.scenarios.base import Progress, RuleChoice, Samples, Scenario, Tracking, chosen, fuse_runs
+from track_fusion.scenarios.one_target import Quantity, Row, Sir, charts, sir_alone, sir_fused
 from track_fusion.scenarios.one_target import squared_errors as collect
 from track_fusion.tracks import planar_layout
 
@@ -57,19 +57,18 @@ TRACKING = Tracking(
 )
 
 
-def study(runs: int, seed: int, progress: Callable[[float], None], only: str = "") -> dict[str, Estimate]:
-    """Run the rows of Table I whose names start with `only` over `runs` Monte Carlo runs.
+def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+    """Run the rows of Table I whose names start with `only`: squared norms of the errors, (R, T)."""
+    return squared_errors(runs, seed, progress, chosen(kalman_rows() | particle_rows(), only))
 
-    Returns
-    -------
-    {figure name: Estimate}, names like kf-alone/position_armse_m
-    """
-    errors = squared_errors(range(runs), seed, progress, chosen(kalman_rows() | particle_rows(), only))
-    return {name: armse(squares) for name, squares in errors.items()}
+
+def figures(samples: Samples) -> dict[str, Estimate]:
+    """Average over steps of the root-mean-square over runs, names like kf-alone/position_armse_m."""
+    return {name: armse(squares) for name, squares in samples.items()}
 
 
 def squared_errors(
-    runs: Sequence[int], seed: int, progress: Callable[[float], None], rows: Mapping[str, Row] | None = None
+    runs: Sequence[int], seed: int, progress: Progress, rows: Mapping[str, Row] | None = None
 ) -> dict[str, Array]:
     """Run rows of Table I, by default the Kalman filters', over these Monte Carlo runs.
 
@@ -135,6 +134,7 @@ SCENARIO = Scenario(
     published={f"{row}/{q}": v for row, values in TABLE_1.items() for q, v in zip(QUANTITIES, values, strict=True)},
     published_runs=100,
     default_runs=200,
+    publication_runs=1000,
     assumptions=(
         "the fused posterior is fed back to both filters at every step",
         "the truth starts exactly at the initial mean, the filters at the initial mean and covariance",
@@ -143,7 +143,10 @@ SCENARIO = Scenario(
         "density by itself (arithmetic average: from the union of the weighted particles, @gaussian: after conversion)",
         "particles turned into a Gaussian: 1e-9 of the initial variances is added",
     ),
-    study=study,
+    sample=sample,
+    figures=figures,
+    charts=charts,
+    piece=50,
     tracking=TRACKING,
     rules=RULE_CHOICES,
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -13,12 +13,13 @@ from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.naive import NaiveParams
-from track_fusion.scenarios.base import RuleChoice, Scenario, Tracking, chosen
+from track_fusion.scenarios.base import Progress, RuleChoice, Samples, Scenario, Tracking, chosen
 from track_fusion.scenarios.one_target import (
     GaussianFilter,
     Quantity,
     Row,
     Sir,
+    charts,
     gaussian_alone,
     gaussian_fused,
     sir_alone,
@@ -83,15 +84,14 @@ def rows() -> dict[str, Row]:
     return table
 
 
-def study(runs: int, seed: int, progress: Callable[[float], None], only: str = "") -> dict[str, Estimate]:
-    """Run the rows of Table II whose names start with `only` over `runs` Monte Carlo runs.
+def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+    """Run the rows of Table II whose names start with `only`: squared norms of the errors, (R, T)."""
+    return squared_errors(TRACKING, chosen(rows(), only), QUANTITIES, runs, seed, progress)
 
-    Returns
-    -------
-    {figure name: Estimate}, names like ckf-alone/position_armse_m
-    """
-    errors = squared_errors(TRACKING, chosen(rows(), only), QUANTITIES, range(runs), seed, progress)
-    return {name: armse(squares) for name, squares in errors.items()}
+
+def figures(samples: Samples) -> dict[str, Estimate]:
+    """Average over steps of the root-mean-square over runs, names like ckf-alone/position_armse_m."""
+    return {name: armse(squares) for name, squares in samples.items()}
 
 
 SCENARIO = Scenario(
@@ -102,6 +102,7 @@ SCENARIO = Scenario(
     published={f"{row}/{q}": v for row, values in TABLE_2.items() for q, v in zip(QUANTITIES, values, strict=True)},
     published_runs=100,
     default_runs=100,
+    publication_runs=1000,
     assumptions=(
         "the fused posterior is fed back to both filters at every step",
         "the truth starts exactly at the initial mean, the filters at the initial mean and covariance",
@@ -112,7 +113,9 @@ SCENARIO = Scenario(
         "density by itself (arithmetic average: from the union of the weighted particles, @gaussian: after conversion)",
         "particles turned into a Gaussian: 1e-9 of the initial variances is added",
     ),
-    study=study,
-    tracking=None,
+    sample=sample,
+    figures=figures,
+    charts=charts,
+    piece=50,
     rules=RULE_CHOICES,
 )

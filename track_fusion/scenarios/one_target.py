@@ -16,10 +16,12 @@ from track_fusion.filters import iterated_corrector, particle
 from track_fusion.filters.iterated_corrector import GaussianUpdate
 from track_fusion.filters.particle import Particles
 from track_fusion.linalg import Array
+from track_fusion.metrics.accuracy import rmse
 from track_fusion.models.base import Transition
 from track_fusion.random_streams import stream
+from track_fusion.report.chart import Chart, Series
 from track_fusion.rules import RULES, FusedTracks, SourceTracks
-from track_fusion.scenarios.base import RuleChoice, Tracking
+from track_fusion.scenarios.base import Progress, RuleChoice, Samples, Tracking
 
 #: Particles of so many runs are worked on at once: larger arrays leave the cache.
 SIR_CHUNK = 50
@@ -177,7 +179,7 @@ def squared_errors(
     quantities: Mapping[str, Quantity],
     runs: Sequence[int],
     seed: int,
-    progress: Callable[[float], None],
+    progress: Progress,
 ) -> dict[str, Array]:
     """Run every row over the same Monte Carlo runs.
 
@@ -199,3 +201,22 @@ def squared_errors(
                 share = (begin + (part.stop - begin) * (k + 1) / tracking.steps) / len(runs)
                 progress((done + share) / len(rows))
     return found
+
+
+def charts(samples: Samples) -> list[Chart]:
+    """Root-mean-square error over the steps, one chart a filter and quantity."""
+    groups: dict[tuple[str, str], list[Series]] = {}
+    for name, squares in samples.items():
+        row, _, quantity = name.rpartition("/")
+        one, _, rule = row.partition("-")
+        steps = np.arange(1, squares.shape[1] + 1)
+        groups.setdefault((one, quantity), []).append(Series(rule, steps, rmse(squares)))
+    return [
+        Chart(
+            f"{one.upper()}: {quantity.replace('_armse_', ' RMSE, ')}",
+            "step",
+            quantity.rpartition("_")[2],
+            tuple(lines),
+        )
+        for (one, quantity), lines in groups.items()
+    ]

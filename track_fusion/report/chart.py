@@ -1,0 +1,72 @@
+"""Charts as data: what a scenario shows, drawn by report/drawing.py and written to the JSON as it is."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+from track_fusion.linalg import Array
+
+Style = Literal["line", "dashed", "dotted", "steps", "points", "bars"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Series:
+    """One line, cloud of points or set of bars.
+
+    Attributes
+    ----------
+    label : str        in the legend; "" = not there
+    x, y : (P,)        NaN in y interrupts a line
+    style : Style
+    error : (P,) or None    half the width of a band (of bars: of a whisker) around y
+    """
+
+    label: str
+    x: Array
+    y: Array
+    style: Style = "line"
+    error: Array | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Contours:
+    """Lines of equal value of a function of the plane.
+
+    Attributes
+    ----------
+    label : str
+    x (P,), y (Q,), z (Q, P)
+    levels : tuple of float    values of z at the lines, ascending
+    """
+
+    label: str
+    x: Array
+    y: Array
+    z: Array
+    levels: tuple[float, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Chart:
+    """One panel.
+
+    Attributes
+    ----------
+    title, x_label, y_label : str    with units
+    series : tuple of Series
+    contours : tuple of Contours
+    log_x, log_y : bool              logarithmic axes
+    equal : bool                     one unit is as long along x as along y
+    ticks : mapping or None          x position -> text, for bars and groups
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    series: tuple[Series, ...] = ()
+    contours: tuple[Contours, ...] = ()
+    log_x: bool = False
+    log_y: bool = False
+    equal: bool = False
+    ticks: dict[float, str] | None = None
