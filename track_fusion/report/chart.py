@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
+import numpy as np
+
 from track_fusion.linalg import Array
 
 Style = Literal["line", "dashed", "dotted", "steps", "points", "bars"]
@@ -70,3 +72,14 @@ class Chart:
     log_y: bool = False
     equal: bool = False
     ticks: dict[float, str] | None = None
+
+
+#: Points around an ellipse.
+AROUND = 73
+
+
+def ellipse(label: str, mean: Array, cov: Array, sigmas: float = 2.0, style: Style = "line") -> Series:
+    """Ellipse of so many standard deviations of a Gaussian of the plane, mean (2,), cov (2, 2), as a line."""
+    angle = np.linspace(0.0, 2.0 * np.pi, AROUND)
+    x, y = mean[:, None] + sigmas * np.linalg.cholesky(cov) @ np.stack([np.cos(angle), np.sin(angle)])
+    return Series(label, x, y, style)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from track_fusion.linalg import Array
+from track_fusion.report.chart import ellipse
 from track_fusion.rules import RULES, Rule, SourceTracks
 
 #: The densities of Fig. 1 are not printed. This pair is assumed: trace-optimal covariance intersection gives it the
@@ -59,17 +60,16 @@ def draw_rules(path: Path) -> list[str]:
 def _panel(axes: Any, group: Sequence[Rule], separation: float) -> None:
     tracks = two_tracks(separation)
     for mean, cov in zip(tracks.mean, tracks.cov, strict=True):
-        axes.plot(*_ellipse(mean, cov), "--", color="0.4", lw=1.0)
+        _outline(axes, mean, cov, "--", color="0.4", lw=1.0)
         axes.plot(*mean, "+", color="0.4")
     for rule, color in zip(group, COLORS, strict=False):
         fused = rule(tracks)
-        axes.plot(*_ellipse(fused.mean, fused.cov), color=color, lw=1.5, label=rule.key)
+        _outline(axes, fused.mean, fused.cov, color=color, lw=1.5, label=rule.key)
         axes.plot(*fused.mean, ".", color=color)
     axes.set_aspect("equal", "datalim")
     axes.tick_params(labelsize=7)
 
 
-def _ellipse(mean: Array, cov: Array) -> Array:
-    """Points of the one-sigma ellipse, (2, 73)."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 73)
-    return np.asarray(mean[:, None] + np.linalg.cholesky(cov) @ np.stack([np.cos(angle), np.sin(angle)]))
+def _outline(axes: Any, mean: Array, cov: Array, *style: str, **looks: Any) -> None:
+    line = ellipse("", mean, cov, sigmas=1.0)
+    axes.plot(line.x, line.y, *style, **looks)
