@@ -2,50 +2,82 @@
 
 from __future__ import annotations
 
-import dataclasses
+import base64
 import os
 import pty
 import re
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
-from typing import Any
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
 
-import numpy as np
 import pytest
 from cli.runner import DEADLINE_S, ROOT, refusal, run, strict_json
-
-from track_fusion.metrics.accuracy import Estimate
-from track_fusion.scenarios import SCENARIOS, Samples, Scenario
 
 VERDICTS = {"agrees", "ordering only", "does not reproduce", "not given"}
 NAME = re.compile(r"^[a-z0-9]+-[a-z0-9_]+(@[a-z0-9_]+)?/[a-z0-9_]+_[a-z0-9]+$")
 
 
+#: A scenario that takes no time; its file notes what it is asked for.
+COIN = """
+from pathlib import Path
+import numpy as np
+from track_fusion.metrics.accuracy import Estimate
+from track_fusion.report.chart import Chart, Series
+from track_fusion.scenarios.base import Claim, Scenario
+
+def sample(runs, seed, progress, only=""):
+    Path(__file__).with_suffix(f".asked-{seed}-{runs.start}-{runs.stop}").touch()
+    return {"heads": np.arange(runs.start, runs.stop) + seed}
+
+def figures(samples):
+    runs = len(samples["heads"])
+    return {
+        "kf-alone/error_m": Estimate(1.0, 0.01, runs),
+        "kf-ic/error_m": Estimate(9.0, 0.01, runs),
+        "kf-naive/error_m": Estimate(2.0, float("nan"), runs),
+        "kf-sum/heads_1": Estimate.exact(samples["heads"].sum()),
+    }
+
+def charts(samples):
+    return [Chart("Heads & <tails>", "run", "1", (Series("heads", np.arange(3.0), np.array([1.0, np.nan, 2.0])),))]
+
+SCENARIO = Scenario(
+    "NAME", "A fair <coin>", "Nobody", "nothing", {"kf-alone/error_m": 1.01, "kf-ic/error_m": 0.5}, 10, RUNS, 900,
+    ("it is fair",), sample, figures, charts, (
+        Claim("heads & tails are rare", "Fig. 1", ("kf-sum/heads_1",), lambda e: e.value < 0),
+        Claim.order("naive lies between", "Fig. 2", "kf-alone/error_m", "kf-naive/error_m", "kf-ic/error_m"),
+        Claim.order("nobody measured it", "Fig. 3", "kf-alone/error_m", "kf-nobody/error_m"),
+    ), piece=20)
+"""
+
+
+class Coin(NamedTuple):
+    """The files of two such scenarios."""
+
+    coin: str
+    dice: str
+    folder: Path
+
+    def asked(self) -> set[str]:
+        """What they were asked for: name.asked-seed-first-last."""
+        return {path.name for path in self.folder.glob("*.asked-*")}
+
+
 @pytest.fixture
-def coin(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
-    """Register two scenarios that take no time, and return the list of (runs, seed) they were asked for."""
-    asked: list[tuple[int, int]] = []
+def files(tmp_path: Path) -> Coin:
+    for name, runs in (("coin", 30), ("dice", 60)):
+        (tmp_path / f"{name}.py").write_text(COIN.replace("NAME", name).replace("RUNS", str(runs)))
+    return Coin(str(tmp_path / "coin.py"), str(tmp_path / "dice.py"), tmp_path)
 
-    def sample(runs: Sequence[int], seed: int, progress: Callable[[float], None], only: str = "") -> Samples:
-        asked.append((len(runs), seed))
-        progress(1.0)
-        return {"runs": np.zeros(len(runs))}
 
-    def figures(samples: Samples) -> dict[str, Estimate]:
-        runs = len(samples["runs"])
-        return {
-            "kf-alone/error_m": Estimate(1.0, 0.01, runs),
-            "kf-ic/error_m": Estimate(9.0, 0.01, runs),
-            "kf-naive/error_m": Estimate(2.0, float("nan"), runs),
-        }
-
-    scenario = Scenario("coin", "A coin", "Nobody", "nothing", {"kf-alone/error_m": 1.01, "kf-ic/error_m": 0.5}, 10, 30,
-                        30, ("it is fair",), sample, figures, lambda samples: [])  # fmt: skip
-    monkeypatch.setitem(SCENARIOS, "coin", scenario)
-    monkeypatch.setitem(SCENARIOS, "dice", dataclasses.replace(scenario, key="dice", default_runs=60))
-    return asked
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let results go to a folder of the test's own."""
+    monkeypatch.chdir(tmp_path)
 
 
 def reproduced(*words: str) -> Any:
@@ -56,8 +88,8 @@ def reproduced(*words: str) -> Any:
 
 
 def test_the_linear_scenario_as_json() -> None:
-    answer = reproduced("li2022-linear", "--runs", "20", "--seed", "3")
-    assert list(answer) == ["scenario", "runs", "seed", "figures"]
+    answer = reproduced("li2022-linear", "--only", "kf-", "--runs", "20", "--seed", "3")
+    assert list(answer) == ["scenario", "runs", "seed", "figures", "claims"]
     assert (answer["scenario"], answer["runs"], answer["seed"]) == ("li2022-linear", 20, 3)
     figures = {f["name"]: f for f in answer["figures"]}
     for row in ("alone", "ic", "naive", "arithmetic_average", "covariance_intersection"):
@@ -74,61 +106,151 @@ def test_the_linear_scenario_as_json() -> None:
 
 
 def test_a_seed_decides_the_figures() -> None:
-    first, again, other = (reproduced("li2022-linear", "--runs", "2", "--seed", s) for s in ("5", "5", "6"))
+    first, again, other = (
+        reproduced("li2022-linear", "--only", "kf-", "--runs", "2", "--seed", s) for s in ("5", "5", "6")
+    )
     assert first == again
     assert first["figures"][0]["value"] != other["figures"][0]["value"]
 
 
 def test_of_one_run_the_error_is_not_known() -> None:
-    answer = reproduced("li2022-linear", "--runs", "1")
+    answer = reproduced("li2022-linear", "--only", "kf-", "--runs", "1")
     assert {f["standard_error"] for f in answer["figures"]} == {None}
     assert {f["verdict"] for f in answer["figures"]} == {"not given"}
 
 
-def test_without_runs_the_scenario_decides(coin: list[tuple[int, int]]) -> None:
-    assert reproduced("coin")["runs"] == 30
-    assert coin == [(30, 0)]
+def test_without_runs_the_scenario_decides(files: Coin) -> None:
+    assert reproduced(files.coin)["runs"] == 30
+    assert files.asked() == {"coin.asked-0-0-20", "coin.asked-0-20-30"}
+    assert reproduced(files.coin, "--publication")["runs"] == 900
 
 
-def test_several_names_give_a_list_each_once(coin: list[tuple[int, int]]) -> None:
-    answer = reproduced("dice", "coin", "dice", "--seed", "1")
-    assert [a["scenario"] for a in answer] == ["dice", "coin"]
-    assert coin == [(60, 1), (30, 1)]
+def test_several_names_give_a_list_each_once(files: Coin) -> None:
+    answer = reproduced(files.dice, files.coin, files.dice, "--seed", "1")
+    assert [(a["scenario"], a["runs"]) for a in answer] == [("dice", 60), ("coin", 30)]
+    assert len(files.asked()) == 5
 
 
-def test_the_table_shows_error_published_and_verdict(coin: list[tuple[int, int]]) -> None:
-    result = run("reproduce", "coin")
+def test_no_figure_depends_on_the_number_of_processes(tmp_path: Path) -> None:
+    texts = []
+    for jobs in ("1", "3"):
+        out = tmp_path / f"jobs{jobs}"
+        words = ("li2022-linear", "--only", "kf-", "--runs", "120", "--jobs", jobs, "--out", str(out))
+        assert run("reproduce", *words).exit_code == 0
+        texts.append((out / "results.json").read_bytes())
+    assert texts[0] == texts[1]
+
+
+def test_what_is_written(files: Coin) -> None:
+    result = run("reproduce", files.coin, files.dice, "--out", "here")
+    assert "Written: here/report.html, here/results.json" in result.stdout
+    (coin, dice) = strict_json(Path("here/results.json").read_text())
+    assert (coin["scenario"], dice["scenario"]) == ("coin", "dice")
+    assert {f["name"]: f["value"] for f in coin["figures"]}["kf-sum/heads_1"] == sum(range(30))
+    assert coin["claims"] == [
+        {
+            "claim": "heads & tails are rare", "source": "Fig. 1", "verdict": "does not reproduce",
+            "evidence": {"kf-sum/heads_1": 435.0},
+        },
+        {
+            "claim": "naive lies between", "source": "Fig. 2", "verdict": "agrees",
+            "evidence": {"kf-alone/error_m": 1.0, "kf-naive/error_m": 2.0, "kf-ic/error_m": 9.0},
+        },
+    ]  # fmt: skip
+    assert coin["charts"][0]["series"][0]["y"] == [1.0, None, 2.0]
+
+
+class Page(HTMLParser):
+    """Collects the text, what is referred to, and whether every tag is closed in order."""
+
+    VOID = {"meta", "link", "img", "br"}
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.words: list[str] = []
+        self.references: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.references += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+
+def test_the_page_is_whole_and_asks_for_nothing_from_outside(files: Coin) -> None:
+    assert run("reproduce", files.coin, files.dice, "--out", "here").exit_code == 0
+    text = Path("here/report.html").read_text(encoding="utf-8")
+    found = Page(text)
+    assert found.open == []
+    assert {r for r in found.references if not r.startswith("data:")} == {"#coin", "#dice"}
+    assert "url(" not in text
+    words = " ".join(found.words)
+    for wanted in (
+        "A fair <coin>",
+        "1.000 ± 0.010",
+        "1.01",
+        "does not reproduce",
+        "heads & tails are rare",
+        "it is fair",
+    ):
+        assert wanted in words
+    (picture, _) = [r for r in found.references if r.startswith("data:image/svg+xml")]
+    image = base64.b64decode(picture.partition(",")[2]).decode()
+    assert ElementTree.fromstring(image).tag == "{http://www.w3.org/2000/svg}svg"
+    assert "Heads &amp; &lt;tails&gt;" in image
+
+
+def test_the_table_shows_error_published_and_verdict(files: Coin) -> None:
+    result = run("reproduce", files.coin)
     assert result.exit_code == 0
     assert "error_m, ± standard error" in result.stdout
     rows = [re.split(r" {2,}", line.rstrip()) for line in result.stdout.splitlines()]
     assert ["kf-alone", "1.000 ± 0.010", "1.01", "agrees"] in rows
     assert ["kf-ic", "9.000 ± 0.010", "0.5", "does not reproduce"] in rows
     assert ["kf-naive", "2", "not given"] in rows
+    assert ["naive lies between (1, 2, 9)", "agrees"] in rows
     assert "30, seed 0" in result.stdout
     assert re.search(r"Assumed +it is fair", result.stdout)
 
 
-def test_an_unknown_name_is_refused_before_anything_runs(coin: list[tuple[int, int]]) -> None:
-    line = refusal(run("reproduce", "coin", "li2022-liner"))
+def test_an_unknown_name_is_refused_before_anything_runs(files: Coin) -> None:
+    line = refusal(run("reproduce", files.coin, "li2022-liner"))
     assert line.startswith("Unknown scenario 'li2022-liner'. Did you mean 'li2022-linear'? Valid: ")
-    assert coin == []
+    assert files.asked() == set()
+
+
+def test_an_unknown_row_is_refused() -> None:
+    assert "Unknown row 'kf-naiv_'. Did you mean 'kf-naive'" in refusal(
+        run("reproduce", "li2022-linear", "--only", "kf-naiv_")
+    )
 
 
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        ((), "Missing argument 'NAME...'. See: track-fusion reproduce --help"),
-        (("coin", "--runs", "0"), "Invalid value for '--runs': 0 is not in the range x>=1."),
-        (("coin", "--runs", "many"), "Invalid value for '--runs': 'many' is not a valid integer"),
-        (("coin", "--seed", "-1"), "Invalid value for '--seed': -1 is not in the range x>=0."),
+        ((), "Give names of scenarios, or --all. See: track-fusion reproduce --help"),
+        (("coin.py", "--all"), "Give names of scenarios, or --all. See: track-fusion reproduce --help"),
+        (("coin.py", "--runs", "9", "--publication"), "Give --runs or --publication, not both."),
+        (("coin.py", "--runs", "0"), "Invalid value for '--runs': 0 is not in the range x>=1."),
+        (("coin.py", "--runs", "many"), "Invalid value for '--runs': 'many' is not a valid integer"),
+        (("coin.py", "--seed", "-1"), "Invalid value for '--seed': -1 is not in the range x>=0."),
+        (("coin.py", "--jobs", "0"), "Invalid value for '--jobs': 0 is not in the range x>=1."),
     ],
 )
-def test_wrong_options_are_refused(words: tuple[str, ...], line: str, coin: list[tuple[int, int]]) -> None:
+def test_wrong_options_are_refused(words: tuple[str, ...], line: str, files: Coin) -> None:
     assert refusal(run("reproduce", *words)).startswith(line)
-    assert coin == []
+    assert files.asked() == set()
 
 
-def test_progress_with_time_left_is_shown_on_a_terminal_only() -> None:
+def test_progress_with_time_left_is_shown_on_a_terminal_only(tmp_path: Path) -> None:
     ours, theirs = pty.openpty()
     shown: list[bytes] = []
 
@@ -141,7 +263,20 @@ def test_progress_with_time_left_is_shown_on_a_terminal_only() -> None:
 
     reader = threading.Thread(target=read)
     reader.start()
-    command = [sys.executable, "-m", "track_fusion.cli", "reproduce", "li2022-linear", "--runs", "2", "--json"]
+    command = [
+        sys.executable,
+        "-m",
+        "track_fusion.cli",
+        "reproduce",
+        "li2022-linear",
+        "--only",
+        "kf-",
+        "--runs",
+        "2",
+        "--json",
+        "--out",
+    ]
+    command.append(str(tmp_path))
     try:
         env = {**os.environ, "TERM": "xterm", "COLUMNS": "100"}
         done = subprocess.run(

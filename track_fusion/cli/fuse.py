@@ -42,9 +42,9 @@ def fuse(rule: str, params: str) -> None:
     from track_fusion.cli.output import print_json
     from track_fusion.cli.tracks_json import read_tracks, write_fused
     from track_fusion.params import from_dict
-    from track_fusion.rules import get_rule
+    from track_fusion.scenarios.user_files import find_rule
 
-    chosen = get_rule(rule)
+    chosen = find_rule(rule)
     settings = from_dict(chosen.params, _read_params(params))
     if sys.stdin.isatty():
         click.echo("Reading tracks from the terminal; end with Ctrl-D.", err=True)

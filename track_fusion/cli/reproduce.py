@@ -1,9 +1,11 @@
-"""track-fusion reproduce: a published study repeated by the library, measured beside published."""
+"""track-fusion reproduce: published studies repeated by the library, measured beside published."""
 
 from __future__ import annotations
 
-import contextlib
+import json
+import os
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -12,76 +14,139 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from track_fusion.scenarios import Scenario
+    from track_fusion.scenarios.study import Study
 
 #: Colours of the verdicts in the table.
 STYLES = {"agrees": "green", "ordering only": "yellow", "does not reproduce": "red", "not given": "dim"}
 
 
 @click.command(short_help="Repeat published studies: measured beside published.")
-@click.argument("names", metavar="NAME...", nargs=-1, required=True)
-@click.option("--runs", type=click.IntRange(min=1), help="Monte Carlo runs.  [default: the scenario's own]")
+@click.argument("names", metavar="NAME...", nargs=-1)
+@click.option("--all", "every", is_flag=True, help="All published scenarios (under 15 minutes on two cores).")
+@click.option(
+    "--runs", type=click.IntRange(min=1), help="Monte Carlo runs.  [default: the scenario's own, a quick look]"
+)
+@click.option("--publication", is_flag=True, help="As many runs as figures to be quoted need (hours for --all).")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the random streams.")
 @click.option("--only", default="", metavar="PREFIX", help="Only rows whose names start so, such as kf- (much faster).")
+@click.option(
+    "--jobs", type=click.IntRange(min=1), help="Processes; the figures do not depend on it.  [default: cores]"
+)
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out/reproduce", show_default=True,
+              help="Where results.json, report.html and finished pieces go.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON: one object, or a list of them for several names.")
-def reproduce(names: tuple[str, ...], runs: int | None, seed: int, only: str, as_json: bool) -> None:
+def reproduce(
+    names: tuple[str, ...], every: bool, runs: int | None, publication: bool, seed: int, only: str, jobs: int | None,
+    out: Path, as_json: bool,
+) -> None:  # fmt: skip
     """Run published scenarios in the library and set what was measured beside what was published.
 
-    Equal seeds give equal figures. The verdict on a figure is
+    NAME is a scenario (`track-fusion scenarios` lists them) or a Python file that defines SCENARIO. Writes
+    results.json (figures, claims, the curves of the pictures) and report.html, one page that needs nothing else.
+    A run that was interrupted goes on where it was when the same command is given again. Equal seeds give equal
+    figures. The verdict on a figure is
 
     \b
       agrees               the difference is within 3 standard deviations, of our runs and the paper's together
       ordering only        the figure stands to the others of its table as published
-      does not reproduce   neither
+      does not reproduce   neither; of a claim: it is not true of what was measured
       not given            nothing to compare with, or a single run, whose error is unknown
 
     \b
     Examples:
       track-fusion reproduce li2022-linear
       track-fusion reproduce li2022-linear --only kf- --runs 1000
-      track-fusion reproduce li2022-linear --runs 1000 --seed 1 --json
+      track-fusion reproduce --all --out out/all
+      track-fusion reproduce ./my_scenario.py --json
     """  # noqa: D301  click reads \b as "do not wrap"
     from track_fusion.cli.output import print_json
-    from track_fusion.scenarios import get_scenario
+    from track_fusion.cli.progress import studies
+    from track_fusion.scenarios import SCENARIOS
+    from track_fusion.scenarios.study import Work
+    from track_fusion.scenarios.user_files import find_scenario
 
-    results = []
-    for scenario in [get_scenario(name) for name in dict.fromkeys(names)]:
-        began = time.monotonic()
-        results.append(_run(scenario, runs or scenario.default_runs, seed, only))
+    if bool(names) == every:
+        raise click.UsageError("Give names of scenarios, or --all.")
+    if runs is not None and publication:
+        raise click.UsageError("Give --runs or --publication, not both.")
+
+    def wanted(scenario: Scenario) -> int:
+        if not scenario.random:
+            return scenario.default_runs
+        return runs or (scenario.publication_runs if publication else scenario.default_runs)
+
+    chosen = tuple(SCENARIOS) if every else tuple(dict.fromkeys(names))
+    works = [Work(name, wanted(find_scenario(name)), seed, only) for name in chosen]
+    found = []
+    for study in studies(works, jobs or os.cpu_count() or 1, out / "pieces"):
+        found.append((study, _result(study)))
         if not as_json:
-            _print_tables(scenario, results[-1], time.monotonic() - began)
+            _print_tables(find_scenario(study.work.scenario), found[-1][1], study.took_s)
+    _write(out, found)
     if as_json:
+        results = [result for _, result in found]
         print_json(results[0] if len(results) == 1 else results)
+    else:
+        click.echo(f"Written: {out / 'report.html'}, {out / 'results.json'}")
 
 
-def _run(scenario: Scenario, runs: int, seed: int, only: str) -> dict[str, Any]:
-    """Run a study under a progress bar (on a terminal); return what --json prints."""
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+def _result(study: Study) -> dict[str, Any]:
+    """Judge a study; what --json prints."""
+    from track_fusion.scenarios import judged_claims, judged_figures
+    from track_fusion.scenarios.user_files import find_scenario
 
-    from track_fusion.cli.output import console
-    from track_fusion.scenarios import judged_figures
+    scenario, work = find_scenario(study.work.scenario), study.work
+    measured = scenario.figures(study.samples)
+    return {
+        "scenario": scenario.key,
+        "runs": work.runs,
+        "seed": work.seed,
+        "figures": judged_figures(scenario, measured),
+        "claims": judged_claims(scenario, measured),
+    }
 
-    err = console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    bar = Progress(*columns, console=err, transient=True)
-    task = bar.add_task(f"{scenario.key}, {runs} runs", total=1.0)
-    with bar if err.is_terminal else contextlib.nullcontext():
-        measured = scenario.study(runs, seed, lambda share: bar.update(task, completed=share), only)
-    return {"scenario": scenario.key, "runs": runs, "seed": seed, "figures": judged_figures(scenario, measured)}
+
+def _write(out: Path, found: list[tuple[Study, dict[str, Any]]]) -> None:
+    """Write results.json, which is the same whenever the figures are, and report.html."""
+    import numpy as np
+
+    from track_fusion.cli.app import version
+    from track_fusion.cli.output import plain
+    from track_fusion.report.page import Section, page
+    from track_fusion.scenarios.user_files import find_scenario
+
+    sections = []
+    for study, result in found:
+        scenario = find_scenario(study.work.scenario)
+        sections.append(Section(result, scenario, scenario.charts(study.samples), study.took_s))
+    content = [{**plain(s.result), "charts": plain(s.charts)} for s in sections]
+    (out / "results.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    made = f"track_fusion {version()}, NumPy {np.__version__}, {time.strftime('%Y-%m-%d %H:%M')}"
+    (out / "report.html").write_text(page(sections, made), encoding="utf-8")
 
 
 def _print_tables(scenario: Scenario, result: dict[str, Any], took_s: float) -> None:
-    """Print a table a quantity."""
+    """Print a table a quantity, then the claims."""
     from rich.markup import escape
 
-    from track_fusion.cli.output import console, grid
+    from track_fusion.cli.output import console, grid, table
 
     out = console()
     out.print(f"[bold]{escape(scenario.key)}[/bold]  {escape(scenario.title)}")
     quantities = dict.fromkeys(f["name"].rpartition("/")[2] for f in result["figures"])
     for quantity in quantities:
         out.print("", _table(quantity, [f for f in result["figures"] if f["name"].rpartition("/")[2] == quantity]))
+    if result["claims"]:
+        claims = table("claim", "verdict", title="claims")
+        for c in result["claims"]:
+            evidence = ", ".join(f"{value:.4g}" for value in c["evidence"].values())
+            claims.add_row(escape(f"{c['claim']} ({evidence})"), f"[{STYLES[c['verdict']]}]{c['verdict']}[/]")
+        out.print("", claims)
     out.print()
-    facts = [("Runs", f"{result['runs']}, seed {result['seed']}, {took_s:.1f} s"), ("Paper", scenario.paper)]
+    facts = [
+        ("Runs", f"{result['runs']}, seed {result['seed']}, {took_s:.1f} s of one processor"),
+        ("Paper", scenario.paper),
+    ]
     out.print(grid([*facts, *(("Assumed", a) for a in scenario.assumptions)]))
 
 
@@ -89,20 +154,12 @@ def _table(quantity: str, figures: list[dict[str, Any]]) -> Table:
     from rich.markup import escape
 
     from track_fusion.cli.output import table
+    from track_fusion.report.page import measured_text
 
     found = table("filter and rule", "measured", "published", "verdict", title=f"{quantity}, ± standard error")
     found.columns[1].justify = found.columns[2].justify = "right"
     for f in figures:
-        measured = f"{f['value']:.4g}" if f["standard_error"] is None else rounded(f["value"], f["standard_error"])
         published = "" if f["published"] is None else f"{f['published']:g}"
         verdict = f"[{STYLES[f['verdict']]}]{f['verdict']}[/]"
-        found.add_row(escape(f["name"].rpartition("/")[0]), measured, published, verdict)
+        found.add_row(escape(f["name"].rpartition("/")[0]), measured_text(f), published, verdict)
     return found
-
-
-def rounded(value: float, error: float) -> str:
-    """Write a value and its standard error to two digits of the error."""
-    from math import floor, log10
-
-    digits = max(0, 1 - floor(log10(error))) if error > 0 else 6
-    return f"{value:.{digits}f} ± {error:.{digits}f}"

@@ -1,0 +1,26 @@
+"""Studies under a progress bar with the time left."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from track_fusion.scenarios.study import Study, Work
+
+
+def studies(works: Sequence[Work], jobs: int, store: Path | None) -> Iterator[Study]:
+    """Run studies, showing on a terminal how far each is; yield each as it is done."""
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    from track_fusion.cli.output import console
+    from track_fusion.scenarios.study import run_studies
+
+    err = console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    bar = Progress(*columns, console=err, transient=True)
+    tasks = {work: bar.add_task(f"{work.scenario}, {work.runs} runs", total=1.0) for work in works}
+    with bar if err.is_terminal else contextlib.nullcontext():
+        yield from run_studies(works, jobs, store, lambda work, share: bar.update(tasks[work], completed=share))

@@ -1,0 +1,198 @@
+"""One self-contained HTML page: measured beside published, claims, charts, assumptions; it loads nothing else."""
+
+from __future__ import annotations
+
+import base64
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from html import escape
+from math import floor, log10
+from typing import Any, NamedTuple
+
+from track_fusion.report.chart import Chart
+from track_fusion.report.drawing import svg
+from track_fusion.scenarios.base import Scenario
+
+VERDICTS = ("agrees", "ordering only", "does not reproduce", "not given")
+#: Tables without published figures that are longer than this are folded.
+FOLDED_ABOVE = 8
+
+STYLE = """
+:root { font: 16px/1.5 system-ui, sans-serif; color: #1c2733; background: #fff; }
+body { max-width: 76rem; margin: 0 auto; padding: 0 1rem 4rem; overflow-wrap: break-word; }
+h1 { font-size: 1.7rem; line-height: 1.2; }
+h2 { margin: 3rem 0 .3rem; padding-top: 1rem; border-top: 2px solid #d4dbe2; line-height: 1.25; }
+h3 { margin: 1.6rem 0 .4rem; }
+p { max-width: 46rem; margin: .4rem 0; }
+ul { max-width: 60rem; padding-left: 1.2rem; }
+a { color: #14588f; }
+summary { cursor: pointer; }
+.quiet { color: #53616e; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; margin: .4rem 0; font-variant-numeric: tabular-nums; }
+caption { text-align: left; font-weight: 600; padding: .2rem 0; }
+th, td { text-align: left; padding: .18rem .9rem .18rem 0; border-bottom: 1px solid #e4e9ee; vertical-align: top; }
+.number { text-align: right; white-space: nowrap; }
+td.name { overflow-wrap: anywhere; min-width: 9rem; }
+.agrees { color: #0b6b34; }
+.ordering-only { color: #80590a; }
+.does-not-reproduce { color: #a61b1b; }
+.not-given { color: #53616e; }
+.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(22rem, 100%), 1fr)); gap: 1rem; }
+.charts img { width: 100%; max-width: 36rem; height: auto; }
+"""
+
+
+class Section(NamedTuple):
+    """What the page says of one scenario.
+
+    Attributes
+    ----------
+    result : mapping           scenario, runs, seed, figures, claims, as `track-fusion reproduce --json` prints them
+    scenario : Scenario
+    charts : sequence of Chart
+    took_s : float             processor time in seconds
+    """
+
+    result: Mapping[str, Any]
+    scenario: Scenario
+    charts: Sequence[Chart]
+    took_s: float
+
+
+def page(sections: Sequence[Section], made_by: str) -> str:
+    """Write the page; `made_by` (program, versions, time) is its last line."""
+    title = sections[0].scenario.title if len(sections) == 1 else f"{len(sections)} published scenarios"
+    return f"""<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<link rel="icon" href="data:,"><title>track_fusion: {escape(title)}</title><style>{STYLE}</style></head><body>
+<h1>Measured beside published: {escape(title)}</h1>
+<p>Each figure is measured by this program and set beside what its paper prints. {_explained()}</p>
+{_overview(sections)}
+{"".join(map(_section, sections))}
+<p class="quiet">{escape(made_by)}</p>
+</body></html>
+"""
+
+
+def _explained() -> str:
+    meanings = {
+        "agrees": "within 3 standard deviations of the difference, the error of both studies and the rounding of the "
+        "print together",
+        "ordering only": "it stands to every other row of its table as published",
+        "does not reproduce": "neither; of a claim: it is not true of what was measured",
+        "not given": "the paper prints nothing to compare with",
+    }
+    return " ".join(f"<b class='{_class(verdict)}'>{verdict}</b>: {text}." for verdict, text in meanings.items())
+
+
+def _overview(sections: Sequence[Section]) -> str:
+    rows = []
+    for result, scenario, _, _ in sections:
+        figures = Counter(f["verdict"] for f in result["figures"])
+        claims = Counter(c["verdict"] for c in result["claims"])
+        told = f"{claims['agrees']} of {sum(claims.values())}" if claims else ""
+        cells = [f"<td class='number {_class(v)}'>{figures[v] or ''}</td>" for v in VERDICTS]
+        name = f"<a href='#{escape(scenario.key)}'>{escape(scenario.key)}</a>"
+        rows.append(f"<tr><td class='name'>{name}</td>{''.join(cells)}<td class='number'>{told}</td></tr>")
+    heads = "".join(f"<th class='number'>{v}</th>" for v in VERDICTS)
+    return (
+        "<div class='scroll'><table><caption>Figures by verdict, and claims that hold</caption>"
+        f"<tr><th>scenario</th>{heads}<th class='number'>claims</th></tr>{''.join(rows)}</table></div>"
+    )
+
+
+def _section(section: Section) -> str:
+    result, scenario, charts, took_s = section
+    runs = f"{result['runs']} runs, seed {result['seed']}" if scenario.random else "nothing random"
+    if scenario.random:
+        runs += f"; for figures to be quoted: {scenario.publication_runs} runs; in the paper: {scenario.published_runs}"
+    assumed = "".join(f"<li>{escape(a)}</li>" for a in scenario.assumptions)
+    parts = [
+        f"<h2 id='{escape(scenario.key)}'>{escape(scenario.key)}: {escape(scenario.title)}</h2>",
+        f"<p>{escape(_sentence(scenario.shows))}</p><p class='quiet'>{escape(scenario.paper)}.</p>",
+        f"<p class='quiet'>{runs}; {took_s:.1f} s of one processor.</p>",
+        _claims(result["claims"]),
+        *_tables(result["figures"]),
+        _charts(charts),
+        "<h3>Assumed, where the paper is silent</h3>",
+        f"<ul>{assumed}</ul>" if assumed else "<p>Nothing.</p>",
+    ]
+    return "".join(parts)
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}" + ("" if text.endswith(".") else ".")
+
+
+def _claims(claims: Sequence[Mapping[str, Any]]) -> str:
+    if not claims:
+        return ""
+    rows = [
+        f"<tr><td>{escape(c['claim'])}<br><span class='quiet'>{escape(c['source'])}; "
+        f"{escape(', '.join(f'{n}: {v:.4g}' for n, v in c['evidence'].items()))}</span></td>"
+        f"<td class='{_class(c['verdict'])}'>{escape(c['verdict'])}</td></tr>"
+        for c in claims
+    ]
+    head = "<tr><th>claim</th><th>verdict</th></tr>"
+    return f"<h3>Claims</h3><div class='scroll'><table>{head}{''.join(rows)}</table></div>"
+
+
+def _tables(figures: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Write a table a quantity; long ones with nothing to compare are folded."""
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for figure in figures:
+        groups.setdefault(figure["name"].rpartition("/")[2], []).append(figure)
+    return ["<h3>Figures</h3>", *(_table(quantity, rows) for quantity, rows in groups.items())]
+
+
+def _table(quantity: str, rows: Sequence[Mapping[str, Any]]) -> str:
+    title = quantity_text(quantity)
+    body = "".join(
+        f"<tr><td class='name'>{escape(f['name'].rpartition('/')[0])}</td><td class='number'>{measured_text(f)}</td>"
+        f"<td class='number'>{'' if f['published'] is None else format(f['published'], 'g')}</td>"
+        f"<td class='{_class(f['verdict'])}'>{escape(f['verdict'])}</td></tr>"
+        for f in rows
+    )
+    table = (
+        f"<div class='scroll'><table><caption>{escape(title)}</caption><tr><th>row</th><th class='number'>measured</th>"
+        f"<th class='number'>published</th><th>verdict</th></tr>{body}</table></div>"
+    )
+    if len(rows) <= FOLDED_ABOVE or any(f["published"] is not None for f in rows):
+        return table
+    return f"<details><summary>{escape(title)}: {len(rows)} rows, nothing published</summary>{table}</details>"
+
+
+def quantity_text(quantity: str) -> str:
+    """Write position_armse_m as "position armse / m"; a pure number has no unit."""
+    name, _, unit = quantity.rpartition("_")
+    return name.replace("_", " ") + ("" if unit == "1" else f" / {unit}")
+
+
+def measured_text(figure: Mapping[str, Any]) -> str:
+    """Write a figure with its standard error, where that is known and not zero."""
+    value, error = figure["value"], figure["standard_error"]
+    return rounded(value, error) if error else f"{value:.5g}"
+
+
+def rounded(value: float, error: float) -> str:
+    """Write a value and its standard error to two digits of the error."""
+    digits = max(0, 1 - floor(log10(error)))
+    return f"{value:.{digits}f} ± {error:.{digits}f}"
+
+
+def _charts(charts: Sequence[Chart]) -> str:
+    if not charts:
+        return ""
+    images = [
+        f"<img alt='{escape(c.title, quote=True)}' src='data:image/svg+xml;base64,{_base64(svg(c))}'>" for c in charts
+    ]
+    return f"<h3>Pictures</h3><div class='charts'>{''.join(images)}</div>"
+
+
+def _base64(text: str) -> str:
+    return base64.b64encode(text.encode()).decode()
+
+
+def _class(verdict: str) -> str:
+    return verdict.replace(" ", "-")
