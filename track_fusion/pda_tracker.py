@@ -10,25 +10,27 @@ import dataclasses
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array, triu
 
-from track_fusion.association.gate import gate
+from track_fusion.association.boxes import points_in_boxes
 from track_fusion.chi_square import chi_square_quantile
 from track_fusion.filters import extended
 from track_fusion.filters.probabilistic_data_association import (
     ClutterParams,
+    missed_log_ratio,
     predict_existence,
     update,
     update_existence,
 )
-from track_fusion.linalg import Array
+from track_fusion.linalg import Array, mahalanobis_squared
 from track_fusion.models.base import Motion
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.params import param
 from track_fusion.tracks import CONFIRMED, TrackBatch
 
 SECOND_NS = 1_000_000_000
-#: Candidates are searched in Cartesian coordinates, in a gate so much wider than the exact one in range and bearing.
-SEARCH_MARGIN = 2.0
+#: Detections are searched in boxes around the gates, wider by this share of themselves.
+ROUNDING = 1e-9
 #: A detection counts as claimed when it is a track's with at least this probability.
 CLAIMED = 0.1
 
@@ -99,6 +101,7 @@ class PdaTracker:
 
     def __init__(self, motion: Motion, sensor: RangeBearingSensor, frame_id: str, params: PdaTrackerParams) -> None:
         self.motion, self.sensor, self.frame_id, self.params = motion, sensor, frame_id, params
+        self._gamma = chi_square_quantile(params.gate_probability, len(sensor.noise))
         self.reset()
 
     def reset(self) -> None:
@@ -120,8 +123,8 @@ class PdaTracker:
         """
         dt_s = 0.0 if self.time_ns < 0 else (time_ns - self.time_ns) / SECOND_NS
         self.time_ns = time_ns
+        values = self.sensor.residual(values, np.zeros_like(values))  # bearings wrapped
         tracks, claimed = self._updated(self._predicted(self.tracks, dt_s), values)
-        tracks = self._merged(tracks[tracks.existence >= self.params.deletion_existence])
         free = values[~claimed]
         self.tracks = dataclasses.replace(self._begun(tracks, free, dt_s), leftover=free)
         return self._batch(self.tracks[self.tracks.confirmed])
@@ -133,56 +136,63 @@ class PdaTracker:
         )
 
     def _updated(self, tracks: PdaTracks, values: Array) -> tuple[PdaTracks, NDArray[np.bool_]]:
-        """Associate the scan with every track; tell also which detections tracks claim."""
-        candidate, present = self._candidates(tracks, values)
-        zs = values[candidate] if len(values) else np.zeros((*candidate.shape, values.shape[1]))
-        mean, cov, found = update(tracks.mean, tracks.cov, zs, present, self.sensor, self.params)
-        claimed = np.zeros(len(values), bool)
-        claimed[candidate[found.gated & (found.weight[..., :-1] >= CLAIMED)]] = True
-        existence = update_existence(tracks.existence, found.log_ratio)
+        """Associate the scan with every track, end and merge tracks; tell also which detections tracks claim."""
+        row, col = self._near(tracks.mean, tracks.cov, values)
+        used, row = np.unique(row, return_inverse=True)  # the others miss: their states stay
+        candidate, present = _padded(row, col, len(used))
+        mean, cov, claimed = tracks.mean.copy(), tracks.cov.copy(), np.zeros(len(values), bool)
+        log_ratio = np.full(len(mean), missed_log_ratio(self.params))
+        if len(used):
+            mean[used], cov[used], found = update(
+                mean[used], cov[used], values[candidate], present, self.sensor, self.params
+            )
+            log_ratio[used] = found.log_ratio
+            claimed[candidate[found.gated & (found.weight[..., :-1] >= CLAIMED)]] = True
+            present = found.gated
+        existence = update_existence(tracks.existence, log_ratio)
         confirmed = tracks.confirmed | (existence >= self.params.confirmation_existence)
-        return dataclasses.replace(tracks, mean=mean, cov=cov, existence=existence, confirmed=confirmed), claimed
+        tracks = dataclasses.replace(tracks, mean=mean, cov=cov, existence=existence, confirmed=confirmed)
+        stays = existence >= self.params.deletion_existence
+        track, place = np.nonzero(present & stays[used, None])
+        stays[self._doubled(tracks, used[track], candidate[track, place])] = False
+        return tracks[stays], claimed
 
-    def _candidates(self, tracks: PdaTracks, values: Array) -> tuple[Indices, NDArray[np.bool_]]:
-        """List, for each track, detections that may lie in its gate: indices (N, D'), which are there (N, D')."""
-        at = list(self.motion.layout.position)
-        gamma = SEARCH_MARGIN * chi_square_quantile(self.params.gate_probability, 2)
-        block = tracks.cov[:, at][:, :, at]
-        pairs = gate(tracks.mean[:, at], block, *self.sensor.positions(values), gamma, (0, 1))
-        count = np.bincount(pairs.row, minlength=len(tracks.mean))
-        width = int(count.max(initial=0))
-        candidate, present = np.zeros((len(count), width), np.intp), np.arange(width) < count[:, None]
-        candidate[present] = pairs.col
-        return candidate, present
+    def _near(self, mean: Array, cov: Array, values: Array) -> tuple[Indices, Indices]:
+        """Pairs of track and detection: all that lie in the gate, and some outside; ordered by track."""
+        slope = self.sensor.jacobian(mean)
+        variance = ((slope @ cov) * slope).sum(-1) + np.diagonal(self.sensor.noise)
+        reach = np.sqrt(self._gamma * variance) * (1.0 + ROUNDING)
+        reach[:, 1] = np.minimum(reach[:, 1], np.pi)
+        expected = self.sensor.observe(mean)
+        return points_in_boxes(values, expected - reach, expected + reach, 2.0 * np.pi)
 
-    def _merged(self, tracks: PdaTracks) -> PdaTracks:
-        """Drop tracks that have come to be another; of two the confirmed one stays, else the older."""
-        order = np.lexsort((tracks.track_id, ~tracks.confirmed))
-        tracks = tracks[order]
-        size = self.motion.layout.size
-        pairs = gate(
-            tracks.mean, tracks.cov, tracks.mean, tracks.cov,
-            chi_square_quantile(self.params.merge_probability, size), self.motion.layout.position,
-        )  # fmt: skip
-        stays = np.ones(len(tracks.mean), bool)
-        stays[pairs.col[pairs.row < pairs.col]] = False
-        tracks = tracks[stays]
-        return tracks[np.argsort(tracks.track_id)]
+    def _doubled(self, tracks: PdaTracks, row: Indices, col: Indices) -> Indices:
+        """Tracks that have come to be another; of two the confirmed one stays, else the older.
+
+        Only tracks that have a detection in common, by the pairs of track and detection given, can come to be one.
+        """
+        shape = len(tracks.mean), int(col.max(initial=0)) + 1
+        owner = coo_array((np.ones(len(row), np.int32), (row, col)), shape=shape).tocsr()
+        pairs = triu(owner @ owner.T, 1).tocoo()
+        old, new = pairs.row.astype(np.intp), pairs.col.astype(np.intp)
+        distance = mahalanobis_squared(tracks.mean[old] - tracks.mean[new], tracks.cov[old] + tracks.cov[new])
+        same = distance <= chi_square_quantile(self.params.merge_probability, self.motion.layout.size)
+        newer_stays = tracks.confirmed[new] & ~tracks.confirmed[old]
+        return np.where(newer_stays, old, new)[same]
 
     def _begun(self, tracks: PdaTracks, free: Array, dt_s: float) -> PdaTracks:
         """Begin a track from each pair of unclaimed detections of the last scan and this that may be one target."""
         layout = self.motion.layout
         first, first_cov = self.sensor.positions(tracks.leftover)
-        moved = first_cov + (self.params.speed_sd * dt_s) ** 2 * np.eye(2)
-        now, now_cov = self.sensor.positions(free)
-        gamma = chi_square_quantile(self.params.gate_probability, 2)
-        pairs = gate(first, moved, now, now_cov, gamma, (0, 1))
         mean, cov = np.zeros((len(first), layout.size)), np.zeros((len(first), layout.size, layout.size))
         at, rate = np.array(layout.position), np.array(layout.velocity)
         mean[:, at], cov[:, at[:, None], at] = first, first_cov
         cov[:, rate, rate] = self.params.speed_sd**2
-        mean, cov = extended.predict(mean[pairs.row], cov[pairs.row], self.motion.over(dt_s))
-        mean, cov, _ = extended.update(mean, cov, free[pairs.col], self.sensor)
+        mean, cov = extended.predict(mean, cov, self.motion.over(dt_s))
+        row, col = self._near(mean, cov, free)
+        mean, cov, found = extended.update(mean[row], cov[row], free[col], self.sensor)
+        gated = found.nis <= self._gamma
+        mean, cov = mean[gated], cov[gated]
         count = len(mean)
         return PdaTracks(
             np.concatenate([tracks.mean, mean]),
@@ -201,3 +211,12 @@ class PdaTracker:
             self.motion.layout, self.frame_id, tracks.mean, tracks.cov,
             time_ns=self.time_ns, track_id=tracks.track_id, existence=tracks.existence, status=CONFIRMED,
         )  # fmt: skip
+
+
+def _padded(row: Indices, col: Indices, rows: int) -> tuple[Indices, NDArray[np.bool_]]:
+    """Turn pairs, ordered by row, into a table: for each row its columns (rows, C), and which are there (rows, C)."""
+    count = np.bincount(row, minlength=rows)
+    present = np.arange(int(count.max(initial=0))) < count[:, None]
+    table = np.zeros(present.shape, np.intp)
+    table[present] = col
+    return table, present

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from track_fusion.association import assignment
 from track_fusion.association import gate as gating
 from track_fusion.association.assignment import assign, nearest_neighbour
+from track_fusion.association.boxes import points_in_boxes
 from track_fusion.association.gate import Candidates, gate
 
 GAMMA = float(chi2.ppf(0.99, 4))
@@ -165,3 +166,35 @@ def test_ten_thousand_by_ten_thousand_in_bounded_memory(area):
         tracemalloc.stop()
     assert (found == order).mean() > 0.98
     assert peak < 64e6
+
+
+# ---- points in boxes ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_points_in_boxes_are_those_of_the_definition(seed):
+    rng = np.random.default_rng(seed)
+    count, boxes = rng.integers(0, 60, 2)
+    points = rng.uniform([0.0, -np.pi], [10.0, np.pi], (count, 2))
+    centre = rng.uniform([-1.0, -np.pi], [11.0, np.pi], (boxes, 2))
+    half = rng.exponential(1.0, (boxes, 2)) * rng.choice([1e-3, 1.0, 30.0], (boxes, 1))
+    half[:, 1] = np.minimum(half[:, 1], np.pi)
+    gap = points[None] - centre[:, None]
+    for period in (np.inf, 2.0 * np.pi):
+        turned = gap.copy()
+        if period < np.inf:
+            turned[..., 1] = np.remainder(gap[..., 1] + np.pi, period) - np.pi
+        wanted = np.argwhere((np.abs(turned) <= half[:, None]).all(-1)).reshape(-1, 2)
+        np.testing.assert_array_equal(
+            np.stack(points_in_boxes(points, centre - half, centre + half, period), 1), wanted
+        )
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_sides_belong_to_a_box_and_points_may_coincide(seed):
+    rng = np.random.default_rng(seed)
+    count, boxes = rng.integers(1, 30, 2)
+    points, centre = rng.integers(0, 4, (count, 2)) * 1.0, rng.integers(-2, 7, (boxes, 2)) * 1.0
+    half = rng.integers(0, 3, (boxes, 2))
+    wanted = np.argwhere((np.abs(points[None] - centre[:, None]) <= half[:, None]).all(-1)).reshape(-1, 2)
+    np.testing.assert_array_equal(np.stack(points_in_boxes(points, centre - half, centre + half), 1), wanted)

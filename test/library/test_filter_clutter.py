@@ -182,3 +182,21 @@ def test_an_empty_beginning_is_no_fault():
     for k in range(3):
         assert len(one.step(k * 2_000_000_000, np.zeros((0, 2)))) == 0
     assert len(one.step(6_000_000_000, np.array([[20e3, 0.5]]))) == 0
+
+
+def test_bearings_may_be_counted_from_zero_to_two_pi():
+    """A target to the west, whose bearings lie around pi."""
+    rng, sensor = np.random.default_rng(5), RangeBearingSensor(LAYOUT, 50.0, np.radians(0.2))
+    states = np.array([-40e3, 100.0, 10.0, -60.0]) + SCAN_S * np.arange(15)[:, None] * np.array([10.0, -60.0, 0.0, 0.0])
+    seen = sensor.observe(states) + rng.normal(size=(15, 2)) * np.sqrt(np.diag(sensor.noise))
+    assert np.ptp(np.sign(seen[:, 1])) == 2.0
+    batches = []
+    for turn in (0.0, 2.0 * np.pi):
+        motion = NearlyConstantVelocity(LAYOUT, MotionParams(process_noise=10.0))
+        one = PdaTracker(motion, sensor, "map", PdaTrackerParams(clutter_density=DENSITY))
+        for k, z in enumerate(seen):
+            batch = one.step(int(k * SCAN_S * 1e9), np.array([[z[0], z[1] % (2 * np.pi) if turn else z[1]]]))
+        batches.append(batch)
+    assert [len(b) for b in batches] == [1, 1]
+    np.testing.assert_allclose(batches[1].mean, batches[0].mean, rtol=1e-9)
+    assert np.linalg.norm(batches[0].mean[0, 0, :2] - states[-1, :2]) < 600.0

@@ -90,11 +90,16 @@ def _weights(
     """Association probabilities (..., D + 1) and the log of what they were divided by (...)."""
     with np.errstate(divide="ignore"):
         scale = np.log(params.detection_probability) - np.log(params.clutter_density)
-        missed = np.log1p(-params.detection_probability * params.gate_probability)
     density = -0.5 * (distance + log_det[..., None] + size * np.log(2.0 * np.pi))
     log_weight = np.where(gated, scale + density, -np.inf)
-    none = np.full((*log_weight.shape[:-1], 1), missed)
+    none = np.full((*log_weight.shape[:-1], 1), missed_log_ratio(params))
     return reweighted(np.ones(1), np.concatenate([log_weight, none], -1))
+
+
+def missed_log_ratio(params: ClutterParams) -> float:
+    """Log-likelihood ratio of a scan without a detection in the gate: such a scan leaves mean and cov as they are."""
+    with np.errstate(divide="ignore"):
+        return float(np.log1p(-params.detection_probability * params.gate_probability))
 
 
 def predict_existence(existence: Array, params: ClutterParams) -> Array:
