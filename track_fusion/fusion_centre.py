@@ -26,6 +26,8 @@ RIDGE = 1e-12
 #: Added to variances that may be zero, as those of particles that coincide; SI units squared.
 LEAST_VARIANCE = 1e-24
 
+Rows = NDArray[np.intp]
+
 
 @dataclasses.dataclass(frozen=True)
 class FusionCentreParams(Params):
@@ -44,6 +46,11 @@ class FusionCentreParams(Params):
     )
     fuse_confirmed_only: bool = param(True, "leave tentative source tracks out")
     fuse_coasted: bool = param(True, "let coasted source tracks take part")
+    memory: bool = param(
+        False,
+        "fuse the central track's own prediction, too, before the sources' tracks, and each scan only once; what is "
+        "published stays conservative only by a rule that is so for every cross-correlation",
+    )
     publish_tentative: bool = param(False, "publish central tracks before they are confirmed, too")
 
 
@@ -55,11 +62,12 @@ class StepInfo:
     ----------
     members : (S,) int          source tracks that took part, by source
     changes : Changes           births, confirmations, deletions
-    shared_provenance : int     source tracks that already hold another source's information
+    shared_provenance : int     members that already hold another one's information: source tracks that say so, and
+                                with memory each central track that was fused with new ones
     unconverged : int           fusions whose weights did not converge
     """
 
-    members: NDArray[np.intp]
+    members: Rows
     changes: Changes
     shared_provenance: int
     unconverged: int
@@ -133,12 +141,13 @@ class FusionCentre:
         fresh = np.zeros(self._sources, bool)
         fresh[list(scans)] = True
         self._newest.update({k: self._selected(scan) for k, scan in scans.items()})
-        taking_part = {k: s for k, s in sorted(self._newest.items()) if self._is_young(s, time_ns)}
+        taking_part = {k: s for k, s in sorted(self._newest.items()) if self._takes_part(k, s, fresh, time_ns)}
         pool = _Pool.of(taking_part, self._manager.tracks, time_ns, self._motion)
         target, births = self._associate(pool, fresh)
         members = np.flatnonzero(target >= 0)
         target, source = target[members], pool.source[members]
-        fused, unconverged = self._fuse(pool, members, target, births)
+        remembered = np.unique(target[target < len(self._manager.tracks)]) if self.params.memory else target[:0]
+        fused, unconverged = self._fuse(pool, members, target, births, remembered)
         member = np.zeros((len(fused), self._sources), bool)
         member[target, source] = True
         supported = np.full(len(fused), -1, np.int64)
@@ -147,9 +156,9 @@ class FusionCentre:
         published = self._manager.tracks
         if not (self.params.publish_tentative or published.is_confirmed.all()):
             published = published[published.is_confirmed]
-        foreign = pool.tracks.source[members] & ~_bit(source)
+        foreign = np.count_nonzero(pool.tracks.source[members] & ~pool.bit[members]) + len(remembered)
         taken = np.bincount(source, minlength=self._sources)
-        return published, StepInfo(taken, changes, int(np.count_nonzero(foreign)), unconverged)
+        return published, StepInfo(taken, changes, int(foreign), unconverged)
 
     def _check(self, scan: TrackBatch, time_ns: int) -> None:
         """Refuse a scan before it changes anything."""
@@ -169,10 +178,13 @@ class FusionCentre:
         scan = scan.replace(uuid=None)
         return scan if keep.all() else scan[keep]
 
-    def _is_young(self, scan: TrackBatch, time_ns: int) -> bool:
+    def _takes_part(self, source: int, scan: TrackBatch, fresh: Bools, time_ns: int) -> bool:
+        """Tell whether a source's newest scan does; with memory an older one is in the central tracks already."""
+        if self.params.memory and not fresh[source]:
+            return False
         return len(scan) == 0 or time_ns - int(scan.time_ns.min()) <= self.params.max_scan_age_s * SECOND_NS
 
-    def _associate(self, pool: _Pool, fresh: Bools) -> tuple[NDArray[np.intp], int]:
+    def _associate(self, pool: _Pool, fresh: Bools) -> tuple[Rows, int]:
         """Say for each source track to which central track or newborn it belongs (-1: none); count the newborn."""
         mean, cov, central_mean, central_cov = pool.split()
         count, gamma, position = len(central_mean), self._gamma, self.layout.position
@@ -193,14 +205,19 @@ class FusionCentre:
         return target, len(starters)
 
     def _fuse(
-        self, pool: _Pool, members: NDArray[np.intp], target: NDArray[np.intp], births: int
+        self, pool: _Pool, members: Rows, target: Rows, births: int, remembered: Rows
     ) -> tuple[TrackBatch, int]:
-        """Fuse the members of each target; tracks without members keep their predicted state."""
+        """Fuse the members of each target, those of `remembered` with their own prediction before all.
+
+        Tracks without members keep their predicted state.
+        """
+        members = np.concatenate([len(pool.source) + remembered, members])
+        target = np.concatenate([remembered, target])
         order = members[np.argsort(target, kind="stable")]  # the pool is in source order: members stay so
         old = len(pool.tracks) - len(pool.source)
         counts = np.bincount(target, minlength=old + births)
         first = np.cumsum(counts) - counts
-        parts: list[tuple[NDArray[np.intp], TrackBatch]] = []
+        parts: list[tuple[Rows, TrackBatch]] = []
         coasting = np.flatnonzero(counts == 0)
         if len(coasting):
             kept = pool.tracks[len(pool.source) + coasting]
@@ -218,11 +235,11 @@ class FusionCentre:
         joined = TrackBatch.concatenate([b for _, b in parts])
         return joined[np.argsort(np.concatenate([r for r, _ in parts]), kind="stable")], unconverged
 
-    def _apply(self, pool: _Pool, at: NDArray[np.intp]) -> tuple[TrackBatch, int]:
+    def _apply(self, pool: _Pool, at: Rows) -> tuple[TrackBatch, int]:
         """Put members, (M, K) rows of the pool, through the rule; a single one is taken as it is."""
-        first = pool.tracks[at[:, 0]].replace(
-            source=np.bitwise_or.reduce(_bit(pool.source[at]), axis=1), existence=pool.tracks.existence[at].max(1)
-        )
+        bit = pool.bit[at]
+        existence = np.where(bit > 0, pool.tracks.existence[at], 0.0).max(1)
+        first = pool.tracks[at[:, 0]].replace(source=np.bitwise_or.reduce(bit, axis=1), existence=existence)
         if at.shape[1] == 1:
             return first, 0
         fused = self.rule.fuse(pool.gather(at), self._rule_params)
@@ -241,13 +258,15 @@ class _Pool:
     tracks : TrackBatch    P source tracks, T central tracks
     mean, cov              moments of each, (P + T, n) and (P + T, n, n), fit to be inverted
     source, stamp_ns       source and own stamp of each source track, (P,)
+    bit                    provenance that each brings to a fusion, (P + T,): its source's bit, none for a central one
     """
 
     tracks: TrackBatch
     mean: Array
     cov: Array
-    source: NDArray[np.intp]
+    source: Rows
     stamp_ns: NDArray[np.int64]
+    bit: NDArray[np.uint32]
 
     @classmethod
     def of(
@@ -260,14 +279,17 @@ class _Pool:
         if tracks.components == 1:
             tracks = tracks.replace(cov=sound[:, None])
         source = np.repeat(np.fromiter(scans, np.intp), [len(s) for s in scans.values()])
-        return cls(tracks, mean, sound, source, np.concatenate([b.time_ns for b in batches])[: len(source)])
+        stamp_ns = np.concatenate([b.time_ns for b in batches])[: len(source)]
+        bit = np.zeros(len(tracks), np.uint32)
+        bit[: len(source)] = np.left_shift(np.uint32(1), source.astype(np.uint32))
+        return cls(tracks, mean, sound, source, stamp_ns, bit)
 
     def split(self) -> tuple[Array, Array, Array, Array]:
         """Moments of the source tracks, then of the central ones."""
         count = len(self.source)
         return self.mean[:count], self.cov[:count], self.mean[count:], self.cov[count:]
 
-    def gather(self, at: NDArray[np.intp]) -> SourceTracks:
+    def gather(self, at: Rows) -> SourceTracks:
         """Stack members (M, K) for a rule."""
         dof = self.tracks.dof[at]
         mixture = None
@@ -276,10 +298,6 @@ class _Pool:
             used = int(np.flatnonzero(weight.any((0, 1)))[-1]) + 1  # the rest pads, say for a central track
             mixture = Mixture(weight[..., :used], self.tracks.mean[at, :used], self.tracks.cov[at, :used])
         return SourceTracks(self.mean[at], self.cov[at], None if np.isinf(dof).all() else dof, mixture)
-
-
-def _bit(source: NDArray[np.intp]) -> NDArray[np.uint32]:
-    return np.left_shift(np.uint32(1), source.astype(np.uint32))
 
 
 def _components(fused: FusedTracks) -> tuple[Array, Array, Array]:

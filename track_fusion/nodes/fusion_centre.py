@@ -187,7 +187,7 @@ class FusionCentreNode(ManagedNode):
         if self._last is not None:
             values["members"] = self._last.members.tolist()
             if self._last.shared_provenance and self.centre.rule.guarantee != "conservative":
-                warnings.append(f"{self.centre.rule.key} counts information twice: sources hold each other's")
+                warnings.append(f"{self.centre.rule.key} counts information twice: its members hold each other's")
         return warnings, values
 
 
