@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
@@ -39,6 +40,23 @@ class Estimate:
         low, high = np.interp(ranks, np.arange(runs), values)
         return cls(float(np.median(values)), float(0.5 * (high - low)), runs)
 
+    @classmethod
+    def of_averages(cls, values: Array, statistic: Callable[[Array], Array]) -> Estimate:
+        """Estimate a smooth function of averages over runs, standard error by the jackknife.
+
+        Parameters
+        ----------
+        values : (R, ...)       what is averaged, run by run
+        statistic : callable    averages (L, ...) -> (L,)
+        """
+        values, runs = np.asarray(values, float), len(values)
+        value = float(statistic(values.mean(0)[None])[0])
+        if runs < 2:
+            return cls(value, float("nan"), runs)
+        left_out = statistic((values.sum(0) - values) / (runs - 1))
+        variance = (runs - 1) / runs * ((left_out - left_out.mean()) ** 2).sum()
+        return cls(value, float(np.sqrt(variance)), runs)
+
     def spread(self, runs: int) -> float:
         """Standard deviation that the figure would have in a study of so many runs."""
         return float(self.standard_error * np.sqrt(self.runs / runs))
@@ -56,10 +74,5 @@ def armse(squared_error: Array) -> Estimate:
     ----------
     squared_error : (R, T)    squared norm of the error, run by step
     """
-    runs = len(squared_error)
-    value = float(rmse(squared_error).mean())
-    if runs < 2:
-        return Estimate(value, float("nan"), runs)
-    left_out = np.sqrt((squared_error.sum(0) - squared_error).clip(0) / (runs - 1)).mean(1)
-    variance = (runs - 1) / runs * ((left_out - left_out.mean()) ** 2).sum()
-    return Estimate(value, float(np.sqrt(variance)), runs)
+    # Leaving a run out may round a sum of squares to just below zero.
+    return Estimate.of_averages(squared_error, lambda mean: np.sqrt(mean.clip(0)).mean(-1))

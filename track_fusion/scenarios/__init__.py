@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 from track_fusion.params import unknown_name_error
-from track_fusion.scenarios import li2022_linear, li2022_nonlinear, sharma_gaussians, sharma_mixtures, sharma_scalar
+from track_fusion.scenarios import (
+    li2019_variables,
+    li2022_linear,
+    li2022_nonlinear,
+    sharma_gaussians,
+    sharma_mixtures,
+    sharma_scalar,
+)
 from track_fusion.scenarios.base import Claim, RuleChoice, Samples, Scenario, Tracking, judged_claims, judged_figures
 
-SCENARIOS: dict[str, Scenario] = {
-    module.SCENARIO.key: module.SCENARIO
-    for module in (li2022_linear, li2022_nonlinear, sharma_gaussians, sharma_mixtures, sharma_scalar)
-}
+_MODULES = (
+    li2022_linear,
+    li2022_nonlinear,
+    li2019_variables,
+    sharma_gaussians,
+    sharma_mixtures,
+    sharma_scalar,
+)
+
+SCENARIOS: dict[str, Scenario] = {module.SCENARIO.key: module.SCENARIO for module in _MODULES}
 
 
 def get_scenario(key: str) -> Scenario:
