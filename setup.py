@@ -30,6 +30,7 @@ REPORT = ["matplotlib>=3.6"]
 SCENARIOS = ["pymap3d>=3"]
 TEST = [
     "pytest>=7.4",
+    "pytest-xdist>=3.3",
     "hypothesis>=6.90",
     "mpmath>=1.2",
     "pyriemann>=0.9,<0.12",  # 0.12 asks for NumPy 1.25 but needs 2

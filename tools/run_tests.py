@@ -32,6 +32,10 @@ COLCON = "import sys; from colcon_core.command import main; sys.exit(main())"
 EXTRAS = ("click", "rich", "rosbags", "matplotlib")
 FLOOR = ("numpy==1.26.*", "scipy==1.11.*")
 FLOOR_PYTHONS = ((3, 11), (3, 12))  # NumPy 1.26 has no wheel for later ones
+# Two tests at a time on two cores; a file's tests stay together, for they share processes.
+PARALLEL = ("-n", "auto", "--dist", "loadfile")
+# Threads of BLAS only fight for the cores: with SciPy 1.11's, tests of small matrices take five times as long.
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
 COMMAND_LIMIT_S = 1200  # far above what any one command takes; a hang must not outlive it
 
 
@@ -108,7 +112,7 @@ def pytest(name: str, counts: list[Counts], *arguments: object, python: Path = P
     report.unlink(missing_ok=True)
     command = [python, "-m", "pytest", "-q", "--durations=5", f"--junit-xml={report}", *arguments]
     try:
-        run(command, env={**os.environ, **extra_env})
+        run(command, env={**os.environ, **ONE_THREAD, **extra_env})
     finally:
         if report.exists():
             counts.append(junit_counts(report))
@@ -126,18 +130,22 @@ def make_venv(folder: str, extras: str, *pins: str) -> Path:
 def lint(counts: list[Counts]) -> None:
     """Run ruff, and mypy --strict over the library and the adapters."""
     failures = []
-    for arguments in (["ruff", "check", "--output-format", "concise", "."], ["mypy", "--strict"]):
+    for arguments in (
+        ["ruff", "check", "--output-format", "concise", "."],
+        ["ruff", "format", "--check", "--quiet", "."],
+        ["mypy", "--strict"],
+    ):
         try:
             run([PYTHON, "-m", *arguments])
         except StageFailure:
-            failures.append(arguments[0])
+            failures.append(" ".join(arguments[:2]))
     if failures:
         raise StageFailure(f"{' and '.join(failures)} found something")
 
 
 def suite(counts: list[Counts]) -> None:
     """Run the whole test suite."""
-    pytest("suite", counts)
+    pytest("suite", counts, *PARALLEL)
 
 
 def colcon(counts: list[Counts]) -> None:
@@ -218,7 +226,7 @@ def floor(counts: list[Counts]) -> None:
     if sys.version_info[:2] not in FLOOR_PYTHONS:
         raise StageSkipped("NumPy 1.26 has no wheel for Python {}.{}".format(*sys.version_info[:2]))
     python = make_venv(".venv-floor", "all,test", *FLOOR)
-    pytest("floor", counts, python=python)
+    pytest("floor", counts, *PARALLEL, python=python)
 
 
 def bare(counts: list[Counts]) -> None:

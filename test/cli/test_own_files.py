@@ -101,7 +101,7 @@ def test_a_table_for_people(examples: Path) -> None:
     result = run("compare", str(examples / "two_thermometers.py"), "--rules", "naive,covariance_intersection")
     assert result.exit_code == 0, result.stderr
     assert "2000 runs, seed 0, smaller is better" in result.stdout
-    assert "given: error / k" in result.stdout
+    assert "given: error / K" in result.stdout
     assert re.search(r"naive +covariance_intersection +0\.\d+ ± 0\.\d+ +< \.0001", result.stdout)
 
 

@@ -14,6 +14,8 @@ from track_fusion.report.drawing import svg
 from track_fusion.scenarios.base import Scenario
 
 VERDICTS = ("agrees", "ordering only", "does not reproduce", "not given")
+#: Units whose names in figures lack signs.
+UNITS = {"mps": "m/s", "degps": "deg/s", "m2": "m²", "m4": "m⁴", "k": "K", "k2": "K²"}
 #: Tables without published figures that are longer than this are folded.
 FOLDED_ABOVE = 8
 
@@ -38,6 +40,8 @@ td.name { overflow-wrap: anywhere; min-width: 9rem; }
 .ordering-only { color: #80590a; }
 .does-not-reproduce { color: #a61b1b; }
 .not-given { color: #53616e; }
+.tables { display: flex; flex-wrap: wrap; gap: 0 3rem; align-items: flex-start; }
+.tables > * { max-width: 100%; }
 .charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(22rem, 100%), 1fr)); gap: 1rem; }
 .charts img { width: 100%; max-width: 36rem; height: auto; }
 """
@@ -113,7 +117,7 @@ def _section(section: Section) -> str:
         f"<p>{escape(_sentence(scenario.shows))}</p><p class='quiet'>{escape(scenario.paper)}.</p>",
         f"<p class='quiet'>{runs}; {took_s:.1f} s of one processor.</p>",
         _claims(result["claims"]),
-        *_tables(result["figures"]),
+        _tables(result["figures"]),
         _charts(charts),
         "<h3>Assumed, where the paper is silent</h3>",
         f"<ul>{assumed}</ul>" if assumed else "<p>Nothing.</p>",
@@ -138,12 +142,13 @@ def _claims(claims: Sequence[Mapping[str, Any]]) -> str:
     return f"<h3>Claims</h3><div class='scroll'><table>{head}{''.join(rows)}</table></div>"
 
 
-def _tables(figures: Sequence[Mapping[str, Any]]) -> list[str]:
+def _tables(figures: Sequence[Mapping[str, Any]]) -> str:
     """Write a table a quantity; long ones with nothing to compare are folded."""
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for figure in figures:
         groups.setdefault(figure["name"].rpartition("/")[2], []).append(figure)
-    return ["<h3>Figures</h3>", *(_table(quantity, rows) for quantity, rows in groups.items())]
+    tables = "".join(_table(quantity, rows) for quantity, rows in groups.items())
+    return f"<h3>Figures</h3><div class='tables'>{tables}</div>"
 
 
 def _table(quantity: str, rows: Sequence[Mapping[str, Any]]) -> str:
@@ -166,7 +171,7 @@ def _table(quantity: str, rows: Sequence[Mapping[str, Any]]) -> str:
 def quantity_text(quantity: str) -> str:
     """Write position_armse_m as "position armse / m"; a pure number has no unit."""
     name, _, unit = quantity.rpartition("_")
-    return name.replace("_", " ") + ("" if unit == "1" else f" / {unit}")
+    return name.replace("_", " ") + ("" if unit == "1" else f" / {UNITS.get(unit, unit)}")
 
 
 def measured_text(figure: Mapping[str, Any]) -> str:
