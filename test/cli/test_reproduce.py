@@ -163,7 +163,7 @@ def test_what_is_written(files: Coin) -> None:
 class Page(HTMLParser):
     """Collects the text, what is referred to, and whether every tag is closed in order."""
 
-    VOID = {"meta", "link", "img", "br"}
+    VOID = {"meta", "link", "img", "br", "wbr"}
 
     def __init__(self, text: str) -> None:
         super().__init__()

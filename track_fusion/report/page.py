@@ -34,8 +34,8 @@ summary { cursor: pointer; }
 table { border-collapse: collapse; margin: .4rem 0; font-variant-numeric: tabular-nums; }
 caption { text-align: left; font-weight: 600; padding: .2rem 0; }
 th, td { text-align: left; padding: .18rem .9rem .18rem 0; border-bottom: 1px solid #e4e9ee; vertical-align: top; }
-.number { text-align: right; white-space: nowrap; }
-td.name { overflow-wrap: anywhere; min-width: 9rem; }
+.number { text-align: right; }
+td.number { white-space: nowrap; }
 .agrees { color: #0b6b34; }
 .ordering-only { color: #80590a; }
 .does-not-reproduce { color: #a61b1b; }
@@ -44,6 +44,12 @@ td.name { overflow-wrap: anywhere; min-width: 9rem; }
 .tables > * { max-width: 100%; }
 .charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(22rem, 100%), 1fr)); gap: 1rem; }
 .charts img { width: 100%; max-width: 36rem; height: auto; }
+@media (max-width: 40rem) {
+  .figures, .figures caption, .figures tbody { display: block; }
+  .figures tr { display: grid; grid-template-columns: 7.5rem 5.5rem 1fr; border-bottom: 1px solid #e4e9ee; }
+  .figures th, .figures td { border: 0; text-align: left; }
+  .figures .name { grid-column: 1 / -1; }
+}
 """
 
 
@@ -134,7 +140,7 @@ def _claims(claims: Sequence[Mapping[str, Any]]) -> str:
         return ""
     rows = [
         f"<tr><td>{escape(c['claim'])}<br><span class='quiet'>{escape(c['source'])}; "
-        f"{escape(', '.join(f'{n}: {v:.4g}' for n, v in c['evidence'].items()))}</span></td>"
+        f"{_breakable(', '.join(f'{n}: {v:.4g}' for n, v in c['evidence'].items()))}</span></td>"
         f"<td class='{_class(c['verdict'])}'>{escape(c['verdict'])}</td></tr>"
         for c in claims
     ]
@@ -154,13 +160,15 @@ def _tables(figures: Sequence[Mapping[str, Any]]) -> str:
 def _table(quantity: str, rows: Sequence[Mapping[str, Any]]) -> str:
     title = quantity_text(quantity)
     body = "".join(
-        f"<tr><td class='name'>{escape(f['name'].rpartition('/')[0])}</td><td class='number'>{measured_text(f)}</td>"
+        f"<tr><td class='name'>{_breakable(f['name'].rpartition('/')[0])}</td>"
+        f"<td class='number'>{measured_text(f)}</td>"
         f"<td class='number'>{'' if f['published'] is None else format(f['published'], 'g')}</td>"
         f"<td class='{_class(f['verdict'])}'>{escape(f['verdict'])}</td></tr>"
         for f in rows
     )
     table = (
-        f"<div class='scroll'><table><caption>{escape(title)}</caption><tr><th>row</th><th class='number'>measured</th>"
+        f"<div class='scroll'><table class='figures'><caption>{escape(title)}</caption>"
+        "<tr><th class='name'>row</th><th class='number'>measured</th>"
         f"<th class='number'>published</th><th>verdict</th></tr>{body}</table></div>"
     )
     if len(rows) <= FOLDED_ABOVE or any(f["published"] is not None for f in rows):
@@ -197,6 +205,11 @@ def _charts(charts: Sequence[Chart]) -> str:
 
 def _base64(text: str) -> str:
     return base64.b64encode(text.encode()).decode()
+
+
+def _breakable(name: str) -> str:
+    """Let a long name go on in the next line behind an underscore."""
+    return escape(name).replace("_", "_<wbr>")
 
 
 def _class(verdict: str) -> str:
