@@ -13,8 +13,8 @@ import numpy as np
 from track_fusion.linalg import Array, matvec, transpose
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.models.base import Motion, Sensor
+from track_fusion.models.noise import Noise
 from track_fusion.params import Params, unknown_name_error
-from track_fusion.random_streams import stream
 from track_fusion.report.chart import Chart
 from track_fusion.rules import Rule, SourceTracks
 
@@ -34,6 +34,10 @@ class Tracking:
     dt_s, steps                        sampling interval in seconds, number of filtering steps
     initial_mean (n,), initial_cov (n, n)    of every filter
     sensors : mapping name -> Sensor
+    process_noise, measurement_noise : Noise    of the truth and of the measurements, in units of the motion's and the
+                                                sensors' own, which are what the filters are told
+    initial_noise : Noise | None                of the truth's first state, in units of initial_cov; None = it is the
+                                                initial mean itself
     """
 
     motion: Motion
@@ -42,9 +46,12 @@ class Tracking:
     initial_mean: Array
     initial_cov: Array
     sensors: Mapping[str, Sensor]
+    process_noise: Noise = Noise()
+    measurement_noise: Noise = Noise()
+    initial_noise: Noise | None = None
 
     def truth(self, seed: int, run: int, steps: int | None = None) -> Array:
-        """Draw the target's states at steps 0 to T, (T + 1, n); step 0 is the initial mean itself.
+        """Draw the target's states at steps 0 to T, (T + 1, n).
 
         T is `steps`, the scenario's own number by default; the first states do not depend on it.
         """
@@ -56,20 +63,26 @@ class Tracking:
         steps = self.steps if steps is None else steps
         transition = self.motion.over(self.dt_s)
         factor = transition.noise_factor
-        draws = np.stack([stream(seed, run, "truth").standard_normal((steps, factor.shape[1])) for run in runs])
+        draws = np.stack([self.process_noise.draw(seed, run, "truth", steps, factor.shape[1]) for run in runs])
         states = np.empty((len(runs), steps + 1, len(self.initial_mean)))
-        states[:, 0] = self.initial_mean
+        states[:, 0] = [self._initial(seed, run) for run in runs]
         for k in range(steps):
             # One matrix a run: products of larger ones round differently with the number of runs.
             states[:, k + 1] = transition.advance(states[:, k, None])[:, 0] + matvec(factor, draws[:, k])
         return states
+
+    def _initial(self, seed: int, run: int) -> Array:
+        if self.initial_noise is None:
+            return self.initial_mean
+        draw = self.initial_noise.draw(seed, run, "initial state", 1, len(self.initial_mean))[0]
+        return np.asarray(self.initial_mean + np.linalg.cholesky(self.initial_cov) @ draw)
 
     def measurements(self, truth: Array, seed: int, run: int) -> dict[str, Array]:
         """Draw each sensor's measurements at steps 1 to T, (T, m) each."""
         found = {}
         for name, sensor in self.sensors.items():
             factor = np.linalg.cholesky(sensor.noise)
-            draws = stream(seed, run, name).standard_normal((len(truth) - 1, len(factor)))
+            draws = self.measurement_noise.draw(seed, run, name, len(truth) - 1, len(factor))
             z = sensor.observe(truth[1:]) + draws @ factor.T
             found[name] = sensor.residual(z, np.zeros_like(z))  # angles wrapped
         return found
