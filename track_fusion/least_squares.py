@@ -15,6 +15,8 @@ MAX_STEPS = 300
 SHORT_STEP, SHORTEST = 1e-9, 1e-9
 #: A step must lower the sum by this part of what its slope promises, but for rounding of the sum.
 ARMIJO, ROUNDING = 1e-4, 4e-15
+#: The vector of roots turns by no more than this in a step, in radians: farther off the model of the sum is a guess.
+LONGEST_TURN = 0.5
 #: What is added to the first Hessian, relative to its largest diagonal entry.
 DAMPING = 1e-3
 
@@ -44,7 +46,7 @@ def minimise_squares_on_simplex(residuals: Residuals, start: Array) -> tuple[Sol
     rows, root = np.arange(batch), np.sqrt(start)
     value, gradient, normal = _at(residuals, root, rows)
     metric = _first_metric(normal)
-    part, way = np.ones(batch), -matvec(metric, gradient)
+    part, way = np.ones(batch), _way(metric, gradient, root)
     for step in range(1, MAX_STEPS + 1):
         if not len(rows):
             break
@@ -55,11 +57,11 @@ def minimise_squares_on_simplex(residuals: Residuals, start: Array) -> tuple[Sol
         good = new_value <= value + ARMIJO * promise + ROUNDING * value
         move = np.abs(new**2 - root**2).max(1)
         done = (good & (move <= SHORT_STEP)) | (part <= SHORTEST)
-        metric = _updated(metric, new - root, new_gradient - gradient, good)
+        metric = _updated(metric, _tangent(new - root, new), _tangent(new_gradient - gradient, new), good)
         keep = good[:, None]
         root, gradient = np.where(keep, new, root), np.where(keep, new_gradient, gradient)
         value, part = np.where(good, new_value, value), np.where(good, 1.0, 0.3 * part)
-        way = np.where(keep, -matvec(metric, gradient), way)
+        way = np.where(keep, _way(metric, gradient, root), way)
         if done.any() or step == MAX_STEPS:
             out = done | (step == MAX_STEPS)
             at = rows[out]
@@ -76,6 +78,18 @@ def _at(residuals: Residuals, root: Array, rows: NDArray[np.intp]) -> tuple[Arra
     weighed = slope * root[:, None]
     tangent = 2.0 * (weighed - (weighed @ root[..., None]) * root[:, None])
     return 0.5 * (rest**2).sum(1), matvec(transpose(tangent), rest), transpose(tangent) @ tangent
+
+
+def _tangent(move: Array, root: Array) -> Array:
+    """Take away what would lengthen the vector of roots."""
+    return np.asarray(move - (move * root).sum(1, keepdims=True) * root)
+
+
+def _way(metric: Array, gradient: Array, root: Array) -> Array:
+    """Quasi-Newton step along the sphere of roots, (b, K)."""
+    way = _tangent(-matvec(metric, gradient), root)
+    length = np.linalg.norm(way, axis=1, keepdims=True)
+    return np.asarray(way * np.minimum(1.0, LONGEST_TURN / np.maximum(length, LONGEST_TURN)))
 
 
 def _first_metric(normal: Array) -> Array:

@@ -19,8 +19,8 @@ from track_fusion.rules.elliptical_tracks import EllipticalParams, family_of
 LEAN = 0.9
 #: Sums that differ by less, relatively, are equal.
 TIE = 1e-9
-#: The batch is worked on in pieces whose arrays stay in the cache.
-CHUNK = 64
+#: The batch is worked on in pieces whose largest arrays hold no more numbers than this, to stay in the cache.
+CHUNK_NUMBERS = 2**16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,9 +63,10 @@ def fuse(tracks: SourceTracks, params: QuasiMinimalManhattanParams) -> FusedTrac
     flat = SourceTracks(tracks.mean.reshape(-1, count, n), tracks.cov.reshape(-1, count, n, n))
     constants = family.pull * family.kappa, family.radius_squared, 2.0 * family.b
     pull, radius, weight = (np.broadcast_to(v, batch).reshape(-1) for v in constants)
+    chunk = max(1, CHUNK_NUMBERS // ((count + 1) * count * n * n))
     parts = [
-        _weights(flat.mean[i : i + CHUNK], flat.cov[i : i + CHUNK], *(v[i : i + CHUNK] for v in (pull, radius, weight)))
-        for i in range(0, max(len(flat.mean), 1), CHUNK)
+        _weights(flat.mean[i : i + chunk], flat.cov[i : i + chunk], *(v[i : i + chunk] for v in (pull, radius, weight)))
+        for i in range(0, max(len(flat.mean), 1), chunk)
     ]
     found = Solution.concatenate(parts)
     weights = found.weights.reshape(*batch, count)
