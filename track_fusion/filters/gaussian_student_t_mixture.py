@@ -9,13 +9,14 @@ approximated by independent factors for the state (Gaussian), the two scales, in
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import digamma
 
 from track_fusion.filters import extended
-from track_fusion.linalg import Array, mahalanobis_squared, matvec, solve, symmetrise, transpose
+from track_fusion.linalg import Array, matvec, outer, solve, symmetrise, transpose
 from track_fusion.models.base import Sensor
 from track_fusion.params import Params, param
 
@@ -31,7 +32,9 @@ class MixtureNoiseParams(Params):
     gaussian_count: float = param(0.85, "a: prior count of Gaussian noises", low=0.0, strict=True)
     student_count: float = param(0.15, "b: prior count of Student-t noises", low=0.0, strict=True)
     max_iterations: int = param(100, "end after so many iterations", low=1)
-    tolerance: float = param(1e-10, "end when the shares of Gaussian noise change by less than this", low=0.0)
+    tolerance: float = param(
+        1e-10, "end when shares of Gaussian noise and, relatively, precisions change by less", low=0.0
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +46,7 @@ class Robustness:
     state_share, noise_share : (...)        probability that the prediction's, the measurement's error is Gaussian
     state_precision, noise_precision : (...)    factor on the nominal information: small for an outlier
     converged : (...) bool
-    iterations : int
+    iterations : int                            of the slowest
     """
 
     state_share: Array
@@ -79,51 +82,83 @@ def update(
     References    Y. Huang, Y. Zhang, Y. Zhao, J. Chambers, A novel robust Gaussian-Student's t mixture
                   distribution based Kalman filter, 2019.
     """
-    slope, residual = sensor.jacobian(mean), sensor.residual(z, sensor.observe(mean))
-    lead = np.broadcast_shapes(mean.shape[:-1], z.shape[:-1])
-    share, weight = np.full((2, *lead), params.gaussian_count / _total(params)), np.ones((2, *lead))
-    change, iteration = np.full(lead, np.inf), 0
-    while iteration < params.max_iterations and (change > params.tolerance).any():
-        offset, posterior = _condition(cov, residual, slope, sensor.noise, share + (1.0 - share) * weight)
-        state_square = mahalanobis_squared(offset, cov) + _trace_ratio(cov, posterior)
-        left, seen = residual - matvec(slope, offset), slope @ posterior @ transpose(slope)
-        noise = np.broadcast_to(sensor.noise, (*lead, *sensor.noise.shape[-2:]))
-        square = np.stack([state_square, mahalanobis_squared(left, noise) + _trace_ratio(noise, seen)])
-        new_share, weight = _noise_factors(square, share, np.array([mean.shape[-1], z.shape[-1]]), params)
-        change, share, iteration = np.abs(new_share - share).max(0), new_share, iteration + 1
+    residual = sensor.residual(z, sensor.observe(mean))
+    lead, (n, m) = np.broadcast_shapes(mean.shape[:-1], z.shape[:-1]), (mean.shape[-1], z.shape[-1])
+    shapes = (n, n), (m,), (m, n), (m, m)
+    parts = (cov, residual, sensor.jacobian(mean), sensor.noise)
+    whole = _Update(*(np.broadcast_to(a, (*lead, *s)).reshape(-1, *s) for a, s in zip(parts, shapes, strict=True)))
+    share, weight, converged, iterations = _ascend(whole, params)
     precision = share + (1.0 - share) * weight
-    offset, posterior = _condition(cov, residual, slope, sensor.noise, precision)
-    converged = np.asarray(change <= params.tolerance)
-    return mean + offset, posterior, Robustness(share[0], share[1], precision[0], precision[1], converged, iteration)
+    offset, posterior = whole.condition(precision)
+    share, precision = share.reshape(2, *lead), precision.reshape(2, *lead)
+    learned = Robustness(share[0], share[1], precision[0], precision[1], converged.reshape(lead), iterations)
+    return mean + offset.reshape(*lead, n), posterior.reshape(*lead, n, n), learned
+
+
+class _Update(NamedTuple):
+    """B linearised updates: covariance (B, n, n), residual (B, m), slope (B, m, n), noise (B, m, m)."""
+
+    cov: Array
+    residual: Array
+    slope: Array
+    noise: Array
+
+    def rows(self, rows: NDArray[np.bool_]) -> _Update:
+        """Return some of them."""
+        return _Update(*(values[rows] for values in self))
+
+    def condition(self, precision: Array) -> tuple[Array, Array]:
+        """Kalman update with covariances divided by their precisions (2, B): shift (B, n), covariance (B, n, n)."""
+        cov, noise = self.cov / precision[0, :, None, None], self.noise / precision[1, :, None, None]
+        cross = self.slope @ cov
+        gain = transpose(solve(symmetrise(cross @ transpose(self.slope) + noise), cross))
+        keep = np.eye(cov.shape[-1]) - gain @ self.slope
+        return matvec(gain, self.residual), symmetrise(keep @ cov @ transpose(keep) + gain @ noise @ transpose(gain))
+
+    def expected_squares(self, precision: Array) -> Array:
+        """Expected squares of the prediction's and the measurement's error by their nominal matrices, (2, B)."""
+        offset, posterior = self.condition(precision)
+        left, seen = self.residual - matvec(self.slope, offset), self.slope @ posterior @ transpose(self.slope)
+        pairs = (self.cov, outer(offset) + posterior), (self.noise, outer(left) + seen)
+        return np.stack([np.trace(solve(nominal, square), axis1=-2, axis2=-1) for nominal, square in pairs])
+
+
+def _ascend(whole: _Update, params: MixtureNoiseParams) -> tuple[Array, Array, NDArray[np.bool_], int]:
+    """Iterate each update by itself to its fixed point.
+
+    Returns
+    -------
+    shares of Gaussian noise (2, B), mean scales of Student-t noise (2, B), converged (B,), most iterations
+    """
+    batch = len(whole.cov)
+    size = np.array([[whole.cov.shape[-1]], [whole.noise.shape[-1]]])
+    shares, weights = np.full((2, batch), params.gaussian_count / _total(params)), np.ones((2, batch))
+    converged, rows = np.zeros(batch, bool), np.arange(batch)
+    part, share, precision, iteration = whole, shares, np.ones((2, batch)), 0
+    while iteration < params.max_iterations and len(rows):
+        new_share, weight = _noise_factors(part.expected_squares(precision), share, size, params)
+        new_precision = new_share + (1.0 - new_share) * weight
+        # The share of an outlier is zero at once, long before its scale has settled.
+        change = np.maximum(np.abs(new_share - share), np.abs(new_precision / precision - 1.0)).max(0)
+        done, share, precision, iteration = change <= params.tolerance, new_share, new_precision, iteration + 1
+        shares[:, rows], weights[:, rows], converged[rows] = share, weight, done
+        if done.any():
+            rows, part, share, precision = rows[~done], part.rows(~done), share[:, ~done], precision[:, ~done]
+    return shares, weights, converged, iteration
 
 
 def _total(params: MixtureNoiseParams) -> float:
     return params.gaussian_count + params.student_count
 
 
-def _condition(cov: Array, residual: Array, slope: Array, noise: Array, precision: Array) -> tuple[Array, Array]:
-    """Kalman update with both covariances divided by their precisions (2, ...): shift (..., n), cov (..., n, n)."""
-    cov, noise = cov / precision[0, ..., None, None], noise / precision[1, ..., None, None]
-    spread = symmetrise(slope @ cov @ transpose(slope) + noise)
-    gain = transpose(solve(spread, slope @ cov))
-    keep = np.eye(cov.shape[-1]) - gain @ slope
-    return matvec(gain, residual), symmetrise(keep @ cov @ transpose(keep) + gain @ noise @ transpose(gain))
-
-
-def _trace_ratio(cov: Array, other: Array) -> Array:
-    """Trace of cov^-1 other."""
-    return np.asarray(np.trace(solve(cov, other), axis1=-2, axis2=-1))
-
-
 def _noise_factors(
     square: Array, share: Array, size: NDArray[np.int64], params: MixtureNoiseParams
 ) -> tuple[Array, Array]:
-    """Update scales, probabilities and indicators from expected squares (2, ...).
+    """Update scales, probabilities and indicators from expected squares (2, B) of vectors of `size` (2, 1) axes.
 
-    Returns the new shares of Gaussian noise and the mean scales of Student-t noise, (2, ...) each. The scales' and
+    Returns the new shares of Gaussian noise and the mean scales of Student-t noise, (2, B) each. The scales' and
     probabilities' factors use the old shares, so that at a fixed point all belong together.
     """
-    size = size.reshape(2, *(1,) * (square.ndim - 1))
     shape, rate = 0.5 * (params.dof + size * (1.0 - share)), 0.5 * (params.dof + (1.0 - share) * square)
     weight, log_weight = shape / rate, digamma(shape) - np.log(rate)
     log_odds = digamma(params.gaussian_count + share) - digamma(params.student_count + 1.0 - share)
