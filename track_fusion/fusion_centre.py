@@ -204,9 +204,7 @@ class FusionCentre:
             starters = np.append(starters, left[starts])
         return target, len(starters)
 
-    def _fuse(
-        self, pool: _Pool, members: Rows, target: Rows, births: int, remembered: Rows
-    ) -> tuple[TrackBatch, int]:
+    def _fuse(self, pool: _Pool, members: Rows, target: Rows, births: int, remembered: Rows) -> tuple[TrackBatch, int]:
         """Fuse the members of each target, those of `remembered` with their own prediction before all.
 
         Tracks without members keep their predicted state.

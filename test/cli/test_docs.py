@@ -14,6 +14,7 @@ from cli.runner import ROOT, refusal, run
 from track_fusion.cli.docs import Section, fusion_centre_sections, sensor_tracker_sections, yaml_value
 from track_fusion.params import specs
 from track_fusion.rules import RULES
+from track_fusion.scenarios import SCENARIOS
 
 NODES = ("fusion_centre", "sensor_tracker")
 #: What rclpy declares by itself, and QoS overrides, which come with each topic.
@@ -39,7 +40,9 @@ def test_the_files_on_disk_are_up_to_date() -> None:
 def test_check_names_what_differs_and_writes_nothing(tree: Path) -> None:
     result = run("docs", "--check", "--root", str(tree))
     assert result.exit_code == 1
-    named = "doc/rules.md, doc/choosing-a-rule.md, config/fusion_centre.yaml, config/sensor_tracker.yaml"
+    named = (
+        "doc/rules.md, doc/choosing-a-rule.md, doc/scenarios.md, config/fusion_centre.yaml, config/sensor_tracker.yaml"
+    )
     assert result.stderr == f"Out of date: {named}. Run: track-fusion docs\n"
     assert [p.name for p in tree.iterdir()] == ["package.xml"]
     assert run("docs", "--root", str(tree)).exit_code == 0
@@ -136,3 +139,12 @@ def test_yaml_values_come_back_as_they_were(value: Any, text: str) -> None:
     back = yaml.safe_load(text)
     assert back == (list(value) if isinstance(value, tuple) else value)
     assert type(back) is (list if isinstance(value, tuple) else type(value))
+
+
+def test_the_page_of_scenarios_has_each_with_its_claims_and_assumptions() -> None:
+    page = (ROOT / "doc" / "scenarios.md").read_text()
+    for scenario in SCENARIOS.values():
+        section = page.split(f"\n## {scenario.key}\n")[1].split("\n## ")[0]
+        assert all(claim.text in section for claim in scenario.claims)
+        assert section.count("* Assumed: ") == len(scenario.assumptions)
+        assert (f"`track-fusion demo {scenario.key}`" in section) == (scenario.tracking is not None)
