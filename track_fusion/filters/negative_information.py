@@ -39,7 +39,12 @@ class Evidence:
 
 
 def update(
-    mixture: Mixture, detector: SoftmaxDetector, chance: Array, samples: int = 512, seed: int = 0
+    mixture: Mixture,
+    detector: SoftmaxDetector,
+    chance: Array,
+    samples: int = 512,
+    seed: int = 0,
+    negligible: float = 0.0,
 ) -> tuple[Mixture, Evidence]:
     """Condition a mixture on an event that has probability chance_c when the target is in the detector's class c.
 
@@ -53,10 +58,13 @@ def update(
     chance : (C,)                between 0 and 1, at least one positive
     samples : int                points for the moments of each new component
     seed : int                   of the points' common shift
+    negligible : float           a component over which the event's probability varies (standard deviation over mean) by
+                                 no more than this keeps its shape and is weighed only: far cameras split nothing
 
     Returns
     -------
-    Mixture    (..., M C') components, C' classes of positive chance, weights of sum one; Evidence
+    Mixture    (..., M C') components, C' classes of positive chance, weights of sum one; of a component that keeps
+               its shape all but the first have weight 0; Evidence
 
     Raises
     ------
@@ -70,21 +78,53 @@ def update(
     """
     chance = _checked(chance, len(detector.bias))
     used = np.flatnonzero(chance > 0)
-    mean, cov = mixture.mean[..., :, None, :], mixture.cov[..., :, None, :, :]
-    log_mass, new_mean, new_cov, share = _products(
-        mean, cov, detector, used, _normal_points(mean.shape[-1], samples, seed)
-    )
-    log_weight = log_of(mixture.weight)[..., None] + np.log(chance[used]) + log_mass
+    points = _normal_points(mixture.mean.shape[-1], samples, seed)
+    log_mass, mean, cov, share = _split(mixture, detector, chance, used, points, negligible)
+    log_weight = log_of(mixture.weight)[..., None] + log_mass
     (*lead, count, classes), n = log_weight.shape, mean.shape[-1]
     flat = log_weight.reshape(*lead, count * classes)
     top = flat.max(-1, keepdims=True)
     weight = np.exp(flat - top)
     total = weight.sum(-1, keepdims=True)
-    found = Mixture(
-        weight / total, new_mean.reshape(*lead, count * classes, n), new_cov.reshape(*lead, count * classes, n, n)
-    )
+    found = Mixture(weight / total, mean.reshape(*lead, count * classes, n), cov.reshape(*lead, count * classes, n, n))
     log_likelihood = (np.log(total) + top)[..., 0] - np.log(mixture.weight.sum(-1))
     return found, Evidence(np.asarray(log_likelihood), share.reshape(*lead, count * classes))
+
+
+def _split(
+    mixture: Mixture,
+    detector: SoftmaxDetector,
+    chance: Array,
+    used: NDArray[np.intp],
+    points: Array,
+    negligible: float,
+) -> tuple[Array, Array, Array, Array]:
+    """Log-probability (..., M, C') of the event, mean, covariance and effective share of every component by class."""
+    log_event, varying = _event(mixture, detector, chance, points, negligible)
+    shape = (*varying.shape, len(used))
+    log_mass = np.full(shape, -np.inf)
+    log_mass[..., 0] = log_event
+    mean = np.repeat(mixture.mean[..., None, :], len(used), -2)
+    cov = np.repeat(mixture.cov[..., None, :, :], len(used), -3)
+    share = np.ones(shape)
+    if varying.any():
+        parts = _products(mean[varying][:, :1], cov[varying][:, :1], detector, used, points)
+        log_mass[varying] = np.log(chance[used]) + parts[0]
+        mean[varying], cov[varying], share[varying] = parts[1:]
+    return log_mass, mean, cov, share
+
+
+def _event(
+    mixture: Mixture, detector: SoftmaxDetector, chance: Array, points: Array, negligible: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Log of the event's probability under each component (..., M), and whether it varies there."""
+    if negligible <= 0.0:
+        return np.zeros(mixture.weight.shape), np.ones(mixture.weight.shape, bool)
+    x = mixture.mean[..., None, :] + points @ transpose(cholesky(mixture.cov))
+    probability = np.exp(detector.log_probability(x)) @ chance
+    average = probability.mean(-1)
+    varying = probability.std(-1) > negligible * average
+    return np.log(np.where(varying, 1.0, average)), varying
 
 
 def _checked(chance: Array, classes: int) -> Array:
