@@ -158,3 +158,29 @@ def test_a_state_with_velocity_is_conditioned_through_its_position():
 def test_impossible_chances_are_refused(chance):
     with pytest.raises(ValueError, match="The 'chance' must hold 4 numbers from 0 to 1, not all 0. Got"):
         update(PRIOR, CONE, np.array(chance))
+
+
+def test_components_that_the_event_hardly_touches_are_weighed_and_keep_their_shape():
+    """Cutting what a cone does not touch makes nothing better."""
+    points, cell = grid()
+    prior = density(PRIOR, points)
+    found, whole = update(PRIOR, CONE, NO_DETECTION, negligible=0.05)
+    kept = found.weight.reshape(3, 3)[:, 1:].sum(1) == 0.0
+    np.testing.assert_array_equal(kept, [False, True, True])
+    np.testing.assert_array_equal(found.mean[[3, 6]], PRIOR.mean[1:])
+    np.testing.assert_array_equal(found.cov[[3, 6]], PRIOR.cov[1:])
+    likelihood = 1.0 - np.exp(CONE.log_probability(points)[:, 0])
+    assert np.exp(whole.log_likelihood) == pytest.approx((prior * likelihood).sum() * cell, rel=2e-3)
+    posterior = prior * likelihood / (prior * likelihood).sum() / cell
+    everything, _ = update(PRIOR, CONE, NO_DETECTION)
+    error, full = (np.abs(density(m, points) - posterior).sum() * cell for m in (found, everything))
+    assert error < full + 0.002
+    np.testing.assert_array_equal(update(PRIOR, CONE, NO_DETECTION, negligible=1e-12)[0].mean, everything.mean)
+
+
+def test_components_are_kept_or_cut_by_themselves_within_a_batch():
+    batch = Mixture(*(np.stack([a, a[::-1]]) for a in (PRIOR.weight, PRIOR.mean, PRIOR.cov)))
+    found, _ = update(batch, CONE, NO_DETECTION, negligible=0.05)
+    alone, _ = update(PRIOR, CONE, NO_DETECTION, negligible=0.05)
+    np.testing.assert_allclose(found.weight[0], alone.weight, rtol=1e-12)
+    np.testing.assert_allclose(found.mean[1].reshape(3, 3, 2)[::-1].reshape(9, 2), alone.mean, rtol=1e-12)

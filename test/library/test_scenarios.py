@@ -1,6 +1,7 @@
 """Li 2022, linear, against the converged values of its errata; verdicts; runs do not depend on each other."""
 
 import math
+import os
 
 import numpy as np
 import pytest
@@ -196,4 +197,8 @@ def test_scenarios_are_found_by_key():
     with pytest.raises(ParameterError, match="Did you mean 'li2022-linear'"):
         get_scenario("li2022-liner")
     assert all(key == s.key for key, s in SCENARIOS.items())
-    assert all(set(s.published) <= set(s.study(2, 0, lambda share: None)) for s in SCENARIOS.values())
+    for scenario in SCENARIOS.values():
+        published = [name.rpartition("/")[0] for name in scenario.published]
+        if published:
+            measured = scenario.study(1, 0, only=os.path.commonprefix(published))
+            assert set(scenario.published) <= set(measured)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -132,25 +133,45 @@ def quotient(start: Mixture, local: Mapping[str, Mixture]) -> Array:
 
 
 def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
-    """Search with these jittered priors: per row the divergences, (R,), the mass near the target, and the density."""
+    """Search with these jittered priors: per row the divergences, (R,), the mass near the target, and the density.
+
+    Notes    Run by run: which components are cut and merged differs from run to run, so a batch saves no time, and
+             its rounding may decide which are.
+    """
     table = {f"gm-{c.name}": c for c in RULE_CHOICES}
     rows = chosen(dict.fromkeys((CENTRE, ALONE, *table, QUOTIENT)), only)
-    start = prior(runs, seed)
-    centre, truth = _searched_by_all(start, progress), bayes(start)
+    return _run_by_run(lambda run, tell: _one_run(run, seed, list(rows), table, tell), runs, progress)
+
+
+def _run_by_run(one: Callable[[int, Progress], Samples], runs: Sequence[int], progress: Progress) -> Samples:
+    """Join the samples of single runs."""
+    found = []
+    for done, run in enumerate(runs):
+        found.append(one(run, partial(_share, progress, done, len(runs))))
+    return {name: np.concatenate([samples[name] for samples in found]) for name in found[0]}
+
+
+def _share(progress: Progress, done: int, count: int, share: float) -> None:
+    progress((done + share) / count)
+
+
+def _one_run(run: int, seed: int, rows: Sequence[str], table: Mapping[str, RuleChoice], progress: Progress) -> Samples:
+    start = prior([run], seed)
+    centre, truth = log_pdf(_searched_by_all(start, progress), POINTS), bayes(start)
     local = _searched_by_each(start, progress) if set(rows) != {CENTRE} else {}
-    densities = {CENTRE: log_pdf(centre, POINTS)}
+    samples = {"prior": _thinned(log_pdf(start, POINTS)), "bayes": _thinned(truth)}
     for done, row in enumerate(rows):
-        if row == ALONE:
-            densities[row] = log_pdf(local[HUB], POINTS)
+        if row == CENTRE:
+            density = centre
+        elif row == ALONE:
+            density = log_pdf(local[HUB], POINTS)
         elif row == QUOTIENT:
-            densities[row] = quotient(start, local)
-        elif row in table:
-            densities[row] = log_pdf(fused(table[row], start, local, seed), POINTS)
+            density = quotient(start, local)
+        else:
+            density = log_pdf(fused(table[row], start, local, seed), POINTS)
+        samples |= _measured(row, density, centre, truth)
         progress(0.5 + 0.5 * (done + 1) / len(rows))
-    samples = {"prior": log_pdf(start, POINTS), "bayes": truth}
-    for row in rows:
-        samples |= _measured(row, densities[row], densities[CENTRE], truth)
-    return {n: v if v.ndim == 1 else _thinned(v) for n, v in samples.items()}
+    return samples
 
 
 def _searched_by_all(start: Mixture, progress: Progress) -> Mixture:
@@ -172,7 +193,7 @@ def _measured(row: str, density: Array, centre: Array, truth: Array) -> Samples:
     found = {
         f"{row}/kld_from_bayes_nats": divergence(truth, density),
         f"{row}/mass_near_target_1": normalised(density)[:, near].sum(-1),
-        row: density,
+        row: _thinned(density),
     }
     return found if row == CENTRE else {f"{row}/kld_nats": divergence(centre, density)} | found
 
@@ -206,7 +227,11 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
     """
     for choice in rules:
         _fuse(choice, seed)
-    start = prior(runs, seed)
+    return _run_by_run(lambda run, tell: _compared(run, seed, rules, tell), runs, progress)
+
+
+def _compared(run: int, seed: int, rules: Sequence[RuleChoice], progress: Progress) -> Samples:
+    start = prior([run], seed)
     centre = log_pdf(_searched_by_all(start, progress), POINTS)
     local, found = _searched_by_each(start, progress), {}
     for done, choice in enumerate(rules):
@@ -249,7 +274,10 @@ def charts(samples: Samples) -> list[Chart]:
     value, error = (np.array([getattr(e, f) for e in estimates.values()]) for f in ("value", "standard_error"))
     bars = Series("", at, value, "bars", np.nan_to_num(error))
     ticks = {float(i): row.removeprefix("gm-") for i, row in enumerate(estimates)}
-    return [*panels, Chart("Divergence from the centralised mixture", "", "KLD, nats", (bars,), log_y=True, ticks=ticks)]
+    return [
+        *panels,
+        Chart("Divergence from the centralised mixture", "", "KLD, nats", (bars,), log_y=True, ticks=ticks),
+    ]
 
 
 def _ways() -> tuple[Series, ...]:
@@ -322,7 +350,7 @@ SCENARIO = Scenario(
     figures=figures,
     charts=charts,
     claims=CLAIMS,
-    piece=2,
+    piece=1,
     rules=RULE_CHOICES,
     compare=compare,
 )
