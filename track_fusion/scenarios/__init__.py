@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from track_fusion.params import unknown_name_error
 from track_fusion.scenarios import (
-<<<<<<< HEAD
-    li2019_variables,
-=======
     ahmed_search,
->>>>>>> b113cd6 (Ahmed 5.3: five robots, a star, channel filters; view cones cut what they touch only)
+    li2019_variables,
     li2022_linear,
     li2022_nonlinear,
     sharma_gaussians,
@@ -17,23 +14,17 @@ from track_fusion.scenarios import (
 )
 from track_fusion.scenarios.base import Claim, RuleChoice, Samples, Scenario, Tracking, judged_claims, judged_figures
 
-<<<<<<< HEAD
 _MODULES = (
     li2022_linear,
     li2022_nonlinear,
     li2019_variables,
+    ahmed_search,
     sharma_gaussians,
     sharma_mixtures,
     sharma_scalar,
 )
 
 SCENARIOS: dict[str, Scenario] = {module.SCENARIO.key: module.SCENARIO for module in _MODULES}
-=======
-SCENARIOS: dict[str, Scenario] = {
-    module.SCENARIO.key: module.SCENARIO
-    for module in (li2022_linear, li2022_nonlinear, ahmed_search, sharma_gaussians, sharma_mixtures, sharma_scalar)
-}
->>>>>>> b113cd6 (Ahmed 5.3: five robots, a star, channel filters; view cones cut what they touch only)
 
 
 def get_scenario(key: str) -> Scenario:
