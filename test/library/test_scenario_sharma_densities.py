@@ -133,5 +133,5 @@ def test_compare_gives_a_divergence_a_run(key):
     found = scenario.compare(choices, [2, 3], 1, lambda share: None)
     assert set(found) == {f"given-{c.name}/kld_nats" for c in choices}
     assert all(v.shape == (2,) and (v > 0).all() for v in found.values())
-    with pytest.raises(ParameterError, match="Got 'mixture_exact', which needs 'common'"):
+    with pytest.raises(ParameterError, match="Got 'mixture_exact', which needs 'common' beside"):
         scenario.compare([RuleChoice("mixture_exact", MixtureExactParams())], [0], 0, lambda share: None)

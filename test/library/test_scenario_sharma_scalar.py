@@ -105,5 +105,5 @@ def test_compare_takes_any_rule_and_refuses_what_needs_more(samples):
     # Independent noises: the prior and the measurement are independent, naive fusion is the Kalman filter.
     steady = SETTINGS[4].ratio * (np.sqrt(1.25) - 0.5)  # P of a random walk with q = r = 1
     assert (found[f"kf-naive/rmse_{name}_1"] ** 2).mean() == pytest.approx(steady, rel=0.05)
-    with pytest.raises(ParameterError, match="Got 'mixture_exact', which needs 'common'"):
+    with pytest.raises(ParameterError, match="Got 'mixture_exact', which needs 'common' beside"):
         SCENARIO.compare([RuleChoice("mixture_exact", MixtureExactParams())], [0], 0, lambda share: None)

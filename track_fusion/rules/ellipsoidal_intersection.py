@@ -68,4 +68,5 @@ RULE = Rule(
     source="Sharma 1.1 (Sijs and Lazar)",
     cost="K n^3",
     order_matters=True,
+    linear=True,
 )

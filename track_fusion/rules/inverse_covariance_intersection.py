@@ -121,4 +121,5 @@ RULE = Rule(
     cost="K n^3",
     order_matters=True,
     affine_equivariant="not with criterion trace: the trace depends on the units of the axes",
+    linear=True,
 )

@@ -10,6 +10,8 @@ from track_fusion.scenarios import (
     li2022_nonlinear,
     sharma_gaussians,
     sharma_mixtures,
+    sharma_network_1,
+    sharma_network_2,
     sharma_scalar,
 )
 from track_fusion.scenarios.base import Claim, RuleChoice, Samples, Scenario, Tracking, judged_claims, judged_figures
@@ -22,6 +24,8 @@ _MODULES = (
     sharma_gaussians,
     sharma_mixtures,
     sharma_scalar,
+    sharma_network_1,
+    sharma_network_2,
 )
 
 SCENARIOS: dict[str, Scenario] = {module.SCENARIO.key: module.SCENARIO for module in _MODULES}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from decimal import Decimal
 from typing import Any, TypeVar
 
@@ -14,9 +14,9 @@ from track_fusion.linalg import Array, matvec, transpose
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.models.base import Motion, Sensor
 from track_fusion.models.noise import Noise
-from track_fusion.params import Params, unknown_name_error
+from track_fusion.params import ParameterError, Params, unknown_name_error
 from track_fusion.report.chart import Chart
-from track_fusion.rules import Rule, SourceTracks
+from track_fusion.rules import RULES, Rule, SourceTracks
 
 T = TypeVar("T")
 
@@ -213,6 +213,22 @@ def fuse_runs(rule: Rule, params: Params, mean: Array, cov: Array) -> tuple[Arra
         return matvec(transpose(fused.mean), mean.reshape(runs, -1)), fused.cov[:1]
     fused = rule.fuse(SourceTracks(mean, np.broadcast_to(cov, (runs, count, n, n))), params)
     return fused.mean, fused.cov
+
+
+def check_needs(choices: Sequence[RuleChoice], given: Collection[str] = ()) -> None:
+    """Check that rules can do with the tracks and the extras that a scenario gives.
+
+    Raises
+    ------
+    ParameterError    a rule needs something else
+    """
+    for choice in choices:
+        missing = [name for name in RULES[choice.key].needed(choice.params) if name not in given]
+        if missing:
+            raise ParameterError(
+                f"The 'rules' parameter must be rules for which this scenario has all they need. Got {choice.name!r}, "
+                f"which needs {missing[0]!r} beside the tracks."
+            )
 
 
 def chosen(rows: Mapping[str, T], only: str) -> dict[str, T]:

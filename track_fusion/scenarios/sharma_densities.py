@@ -13,12 +13,11 @@ from track_fusion.densities.mixture import Mixture, log_pdf, moments
 from track_fusion.densities.mixture_divergence import grid, kl_on_grid, moments_on_grid
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.params import ParameterError
 from track_fusion.random_streams import stream
 from track_fusion.rules import RULES, FusedTracks, SourceTracks
 from track_fusion.rules.geometric_mean_sampling import GeometricMeanSamplingParams
 from track_fusion.rules.harmonic_mean import HarmonicMeanParams
-from track_fusion.scenarios.base import Progress, RuleChoice, Samples, chosen
+from track_fusion.scenarios.base import Progress, RuleChoice, Samples, check_needs, chosen
 
 #: Weight of both densities in every fusion whose weights are not sought.
 HALF = (0.5, 0.5)
@@ -57,16 +56,8 @@ class Pair:
         return log_mean_density(log_pdf(self.parts, points[None]), np.asarray(weights, float), kind)
 
     def by_rule(self, choice: RuleChoice) -> Row:
-        """Fuse by a rule.
-
-        Raises
-        ------
-        ParameterError    the rule needs more than the two densities
-        """
+        """Fuse by a rule."""
         rule, tracks = RULES[choice.key], self.tracks
-        if needed := rule.needed(choice.params):
-            raise ParameterError(f"The 'rules' parameter must name rules for two densities. Got '{rule.key}', which "
-                                 f"needs '{needed[0]}' as well.")  # fmt: skip
         return Row(
             self,
             lambda rng: rule.fuse(dataclasses.replace(tracks, extras={"seed": rng}), choice.params),
@@ -94,7 +85,13 @@ class Pair:
         return kl_on_grid(lambda points: self.exact, lambda points: log_pdf(mixture, points), POINTS)
 
     def compare(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
-        """Fuse by any rules: divergence of the exact harmonic mean density from each result, (R,)."""
+        """Fuse by any rules: divergence of the exact harmonic mean density from each result, (R,).
+
+        Raises
+        ------
+        ParameterError    a rule needs more than the two densities
+        """
+        check_needs(rules)
         samples = sample({f"given-{c.name}": self.by_rule(c) for c in rules}, runs, seed, progress)
         return {name: values for name, values in samples.items() if name.endswith("/kld_nats")}
 

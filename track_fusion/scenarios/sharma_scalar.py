@@ -10,14 +10,13 @@ import numpy as np
 
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate, armse
-from track_fusion.params import ParameterError
 from track_fusion.random_streams import stream
 from track_fusion.report.chart import Chart, Series
 from track_fusion.rules import RULES, SourceTracks
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.harmonic_mean import HarmonicMeanParams
 from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
-from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, Scenario, chosen
+from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, Scenario, check_needs, chosen
 
 STEPS = 100
 
@@ -218,10 +217,7 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
     ------
     ParameterError    a rule needs more than the two tracks
     """
-    for choice in rules:
-        if needed := RULES[choice.key].needed(choice.params):
-            raise ParameterError(f"The 'rules' parameter must name rules for two densities. Got '{choice.key}', which "
-                                 f"needs '{needed[0]}' as well.")  # fmt: skip
+    check_needs(rules)
     normals = _normals(runs, seed)
     found: Samples = {}
     for done, choice in enumerate(rules):
