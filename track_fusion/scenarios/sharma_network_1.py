@@ -86,7 +86,7 @@ SCENARIO = Scenario(
     default_runs=20_000,
     publication_runs=50_000,
     assumptions=(
-        "assumed: the topology, which is a figure: S4 <- S1; S5 <- S2; S6 <- S3; S7 <- S4, S5; S8 <- S5, S6; S9 <- S4, S6; "
+        "assumed: the topology, a figure: S4 <- S1; S5 <- S2; S6 <- S3; S7 <- S4, S5; S8 <- S5, S6; S9 <- S4, S6; "
         "S10 <- S7, S8, S9; each node folds its senders in this order onto its own estimate",
         "assumed: a common prior, from which the state is drawn and at whose mean every node starts: with priors of "
         "their own naive fusion on a tree would be exact",

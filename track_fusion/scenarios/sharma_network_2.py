@@ -71,7 +71,7 @@ SCENARIO = Scenario(
     default_runs=20_000,
     publication_runs=50_000,
     assumptions=(
-        "assumed: the topology, which is a figure: S5 <- S1, S2, S3, S4, folded in this order onto its own estimate, once, "
+        "assumed: the topology, a figure: S5 <- S1, S2, S3, S4, folded in this order onto its own estimate, once, "
         "after five steps of prediction and update",
         "assumed: a common prior, from which the state is drawn and at whose mean every node starts",
         shared.TRACE_WEIGHTS,
