@@ -5,6 +5,8 @@ from __future__ import annotations
 from track_fusion.params import unknown_name_error
 from track_fusion.scenarios import (
     ahmed_search,
+    chen2022_dynamic_1,
+    chen2022_dynamic_2,
     li2019_variables,
     li2022_linear,
     li2022_nonlinear,
@@ -19,6 +21,8 @@ from track_fusion.scenarios.base import Claim, RuleChoice, Samples, Scenario, Tr
 _MODULES = (
     li2022_linear,
     li2022_nonlinear,
+    chen2022_dynamic_1,
+    chen2022_dynamic_2,
     li2019_variables,
     ahmed_search,
     sharma_gaussians,

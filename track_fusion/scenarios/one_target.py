@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from track_fusion.filters import iterated_corrector, particle
+from track_fusion.filters.iterated_corrector import GaussianUpdate
 from track_fusion.filters.particle import Particles
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import rmse
-from track_fusion.models.base import Sensor, Transition
+from track_fusion.models.base import Transition
 from track_fusion.random_streams import stream
 from track_fusion.report.chart import Chart, Series
 from track_fusion.rules import RULES, FusedTracks, SourceTracks
@@ -30,15 +31,10 @@ COVARIANCE_FLOOR = 1e-9
 
 
 class GaussianFilter(NamedTuple):
-    """A filter of means and covariances: its predict and update, as of filters/cubature.py.
-
-    The update also returns what it learned. `dof` is that of its densities, to which what is fed back is matched by
-    mean and covariance.
-    """
+    """A filter of means and covariances: its predict and update, as of filters/cubature.py."""
 
     predict: Callable[[Array, Array, Transition], tuple[Array, Array]]
-    update: Callable[[Array, Array, Array, Sensor], tuple[Array, Array, Any]]
-    dof: float = np.inf
+    update: GaussianUpdate
 
 
 class Sample(NamedTuple):
@@ -97,9 +93,8 @@ def gaussian_fusions(
         mean, cov = one.predict(mean, cov, tracking.motion.over(tracking.dt_s))
         pairs = zip(sample.seen, tracking.sensors.values(), strict=True)
         local = [one.update(mean, cov, z[:, k], sensor)[:2] for z, sensor in pairs]
-        means, covs = np.stack([m for m, _ in local], 1), np.stack([c for _, c in local], 1)
-        dof = np.full(means.shape[:-1], one.dof) if np.isfinite(one.dof) else None
-        fused = RULES[choice.key].fuse(SourceTracks(means, covs, dof), choice.params)
+        tracks = SourceTracks(np.stack([m for m, _ in local], 1), np.stack([c for _, c in local], 1))
+        fused = RULES[choice.key].fuse(tracks, choice.params)
         mean, cov = fused.mean, fused.cov
         yield fused
 
