@@ -62,6 +62,7 @@ def optimise_omega(
     count: int,
     criterion: str = "chernoff",
     omega: Array | None = None,
+    proposal: Mixture | None = None,
 ) -> Omega:
     """Algorithm 1: find the exponent of the weighted exponential product and samples of it.
 
@@ -71,20 +72,17 @@ def optimise_omega(
     rng, count                 generator and number of samples
     criterion : str            chernoff (9), minimax_information_loss (11)
     omega : (...) or None      given exponent, instead of any criterion
+    proposal : Mixture or None what is drawn from, q (..., C); by default :func:`overlap_proposal`
 
     Returns
     -------
     Omega    the samples' weights are p_i^omega p_j^(1 - omega) / q
 
-    Notes         The proposal q is the component-wise product of powers at 1/2, (49)-(51) of Li 2019. It has the
-                  components of (14)-(16) of Ahmed, but weights that count their overlap, and at 1/2
-                  lies above the target up to a constant, so the importance weights are bounded. On
-                  fixed samples both criteria are convex and smooth in omega: Newton's method.
+    Notes         On fixed samples both criteria are convex and smooth in omega: Newton's method.
     References    N. R. Ahmed, Decentralized Gaussian Mixture Fusion through Unified Quotient Approximations,
                   Algorithm 1, eqs. (8)-(11), (18)-(21), kappa of (21) normalised.
     """
-    proposal = product(power(LogMixture.of(first), PROPOSAL_OMEGA), power(LogMixture.of(second), 1 - PROPOSAL_OMEGA))
-    drawn = proposal.normalised
+    drawn = overlap_proposal(first, second) if proposal is None else proposal
     points = sample(drawn, rng, count).points
     log_first, log_second = Factored.of(first).log_pdf(points), Factored.of(second).log_pdf(points)
     log_q = Factored.of(drawn).log_pdf(points)
@@ -100,6 +98,16 @@ def optimise_omega(
         omega, converged, iterations = _minimise(contrast, base, pull)
     weight = omega[..., None] * log_first + (1.0 - omega[..., None]) * log_second - log_q
     return Omega(omega, Weighted(points, weight), converged, iterations)
+
+
+def overlap_proposal(first: Mixture, second: Mixture) -> Mixture:
+    """Component-wise product (..., C1 C2) of powers at 1/2, (49)-(51) of Li 2019, for Algorithm 1 to draw from.
+
+    It has the components of (14)-(16) of Ahmed, but weights that count their overlap, and lies above the target at 1/2
+    up to a constant, so that importance weights are bounded there.
+    """
+    powers = power(LogMixture.of(first), PROPOSAL_OMEGA), power(LogMixture.of(second), 1.0 - PROPOSAL_OMEGA)
+    return product(*powers).normalised
 
 
 def _minimise(contrast: Array, base: Array, pull: Array) -> tuple[Array, NDArray[np.bool_], NDArray[np.intp]]:

@@ -26,17 +26,6 @@ def family_param(default: str) -> str:
     return field
 
 
-def criterion_param() -> str:
-    """Make the field that chooses what the mean minimises."""
-    field: str = param(
-        "squared",
-        "what the mean minimises: the sum of the squared projection distances to the tracks, or of the distances (39), "
-        "which often makes it one track's estimate",
-        choices=("squared", "unsquared"),
-    )
-    return field
-
-
 @dataclasses.dataclass(frozen=True)
 class EllipticalParams(Params):
     """Which family the tracks belong to."""
@@ -44,6 +33,18 @@ class EllipticalParams(Params):
     family: str = family_param("student_t")
     beta: float = param(
         1.0, "shape of family generalized_gaussian: 1 is Gaussian, smaller has heavier tails", low=0.0, strict=True
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class MhdpParams(EllipticalParams):
+    """The family of the tracks, and what the mean minimises."""
+
+    criterion: str = param(
+        "squared",
+        "what the mean minimises: the sum of the squared projection distances to the tracks, or of the distances (39), "
+        "which often makes it one track's estimate",
+        choices=("squared", "unsquared"),
     )
 
 

@@ -6,14 +6,12 @@ import dataclasses
 
 from track_fusion.densities.spd_means import log_euclidean_mean
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.elliptical_tracks import EllipticalParams, criterion_param, family_of, projected
+from track_fusion.rules.elliptical_tracks import MhdpParams, family_of, projected
 
 
 @dataclasses.dataclass(frozen=True)
-class MhdpExplicitParams(EllipticalParams):
+class MhdpExplicitParams(MhdpParams):
     """The family of the tracks, and what the mean minimises."""
-
-    criterion: str = criterion_param()
 
 
 def fuse(tracks: SourceTracks, params: MhdpExplicitParams) -> FusedTracks:

@@ -10,14 +10,13 @@ from track_fusion.densities.gaussian import weighted_product
 from track_fusion.densities.spd_means import karcher_mean
 from track_fusion.params import param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.elliptical_tracks import EllipticalParams, criterion_param, family_of, projected
+from track_fusion.rules.elliptical_tracks import MhdpParams, family_of, projected
 
 
 @dataclasses.dataclass(frozen=True)
-class MhdpIterativeParams(EllipticalParams):
+class MhdpIterativeParams(MhdpParams):
     """The family of the tracks, and what the mean and the scatter minimise."""
 
-    criterion: str = criterion_param()
     scatter: str = param(
         "barycenter",
         "fused scatter: barycenter of the projected tracks (58), or the intersection (49)-(50) at the mean's weights",

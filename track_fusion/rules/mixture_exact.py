@@ -13,13 +13,8 @@ from track_fusion.densities.log_domain import normalised
 from track_fusion.densities.mixture import Factored, Mixture, chosen, moments, same, sample
 from track_fusion.densities.mixture_proposals import (
     MOST_SPREAD,
-    Pruned,
-    direct_local_sampling,
-    heavy_tail,
     indirect_global_sampling,
-    inflated_naive,
     laplace_proposal,
-    laplace_proposals,
     prune_mixands,
 )
 from track_fusion.densities.mixture_quotient import (
@@ -36,11 +31,12 @@ from track_fusion.densities.mixture_sampling import Weighted, weighted_em
 from track_fusion.linalg import Array, is_positive_definite
 from track_fusion.params import param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.mixture_common import Generators, ReductionParams, Step, fold_mixtures, fuse_sampled
+from track_fusion.rules.mixture_common import Generators, Step, fold_mixtures, fuse_sampled
+from track_fusion.rules.mixture_quotients import QuotientParams, sample_mixands
 
 
 @dataclasses.dataclass(frozen=True)
-class MixtureExactParams(ReductionParams):
+class MixtureExactParams(QuotientParams):
     """How the quotient becomes a mixture."""
 
     method: str = param(
@@ -50,21 +46,7 @@ class MixtureExactParams(ReductionParams):
         "expectation maximisation, naive_bayes: leave the common information in",
         choices=("dls", "igs", "mmgd", "laplace", "common_proposal", "naive_bayes"),
     )
-    proposal: str = param(
-        "heavy_tail",
-        "what dls samples from: the naive mean with a component's covariance (ingis), Laplace's approximation (lagis), "
-        "or that with heavy tails (heavy_tail)",
-        choices=("ingis", "lagis", "heavy_tail"),
-    )
-    samples: int = param(1000, "samples for igs and common_proposal, in all", low=10)
-    mixand_samples: int = param(100, "samples for dls, each mixand", low=10)
-    default_variance: float = param(
-        0.0, "smallest variance of any axis that ingis samples with, alpha in (52); 0: the components' own", low=0.0,
-        unit="axis unit^2",
-    )  # fmt: skip
     inflation: float = param(2.0, "factor on the covariances that igs samples with", low=1.0)
-    prune_nats: float = param(14.0, "mixands this far below the largest are not sampled", low=0.0, unit="nat")
-    em_components: int = param(0, "components that common_proposal fits; 0: as many as the larger mixture", low=0)
     not_integrable: str = param(
         "refuse", "pairs of components whose quotient has no integral: refuse the fusion, or skip these pairs",
         choices=("refuse", "skip"),
@@ -112,8 +94,7 @@ def fuse(tracks: SourceTracks, params: MixtureExactParams) -> FusedTracks:
 
         return fold_mixtures(piece, params, step, start)
 
-    points = max(params.samples, params.largest_product(tracks) * params.mixand_samples)
-    return fuse_sampled(tracks, points, fuse_piece)
+    return fuse_sampled(tracks, params.points(tracks), fuse_piece)
 
 
 def common_information(tracks: SourceTracks) -> list[Mixture]:
@@ -215,27 +196,22 @@ def _prepared(problem: Problem, params: MixtureExactParams) -> tuple[Quotient, B
 def _dls(problem: Problem, params: MixtureExactParams, rng: np.random.Generator) -> Result:
     quotient, bound, found, info = _prepared(problem, params)
     kept = prune_mixands(quotient, bound.log_weight, found.log_moment, params.prune_nats)
-    found = Laplace(*(_take(a, kept.order) for a in found))
-    if params.proposal == "ingis":
-        proposal = inflated_naive(kept.quotient, problem.first, problem.second, params.default_variance, kept.order)
-    elif params.proposal == "lagis":
-        proposal = laplace_proposals(found)
-    else:
-        proposal = heavy_tail(found, _widest(bound, found, kept))
-    local = direct_local_sampling(kept.quotient, proposal, rng, params.mixand_samples)
-    ess = (local.mixture.weight * local.ess).sum(-1) / params.mixand_samples
-    return local.mixture, info | {"ess": ess, "log_eta": local.log_eta, "pruned": kept.share}
+
+    def approximate() -> Laplace:
+        return Laplace(*(_take(a, kept.order) for a in found))
+
+    def wide(near: Laplace) -> Array:
+        """Covariances of the Gaussians above the mixands; where there is none, the widest that heavy tails allow."""
+        sure = _take(bound.sure, kept.order)
+        return np.where(sure[..., None, None], _take(bound.cov, kept.order), MOST_SPREAD * near.cov)
+
+    mixture, more = sample_mixands(kept, problem.first, problem.second, approximate, wide, params, rng)
+    return mixture, info | more
 
 
 def _take(array: NDArray[Any], order: NDArray[np.intp]) -> NDArray[Any]:
     tail = (1,) * (array.ndim - order.ndim)
     return np.take_along_axis(array, order.reshape(*order.shape, *tail), order.ndim - 1)
-
-
-def _widest(bound: Bound, found: Laplace, kept: Pruned) -> Array:
-    """Covariances of the Gaussians above the mixands; where there is none, the widest that heavy tails allow."""
-    cov, sure = _take(bound.cov, kept.order), _take(bound.sure, kept.order)
-    return np.where(sure[..., None, None], cov, MOST_SPREAD * found.cov)
 
 
 def _igs(problem: Problem, params: MixtureExactParams, rng: np.random.Generator) -> Result:
@@ -265,8 +241,7 @@ def _common_proposal(problem: Problem, params: MixtureExactParams, rng: np.rando
         Factored.of(m).log_pdf(points) for m in (problem.first, problem.second, problem.common)
     )
     drawn = Weighted(points, log_first + log_second - 2.0 * log_common)
-    count = params.em_components or max(problem.first.count, problem.second.count)
-    learned = weighted_em(drawn, count, rng)
+    learned = weighted_em(drawn, params.learned_count(problem.first, problem.second), rng)
     info = {"converged": learned.converged, "ess": drawn.ess / params.samples, "log_eta": drawn.log_eta}
     return learned.mixture, info
 

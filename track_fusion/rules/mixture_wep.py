@@ -11,39 +11,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.gaussian import weighted_product
-from track_fusion.densities.log_domain import log_of, normalised
+from track_fusion.densities.log_domain import log_of, log_sum_exp, normalised
 from track_fusion.densities.mixture import Mixture, chosen, same, stacked
 from track_fusion.densities.mixture_algebra import LogMixture, first_order, product
-from track_fusion.densities.mixture_proposals import (
-    Proposal,
-    Pruned,
-    direct_local_sampling,
-    heavy_tail,
-    inflated_naive,
-    laplace_proposals,
-    prune_mixands,
+from track_fusion.densities.mixture_proposals import prune_mixands
+from track_fusion.densities.mixture_quotient import Laplace, laplace, wep_bound, wep_quotient
+from track_fusion.densities.mixture_sampling import (
+    PROPOSAL_OMEGA,
+    Omega,
+    optimise_omega,
+    overlap_proposal,
+    single_shot_em,
+    weighted_em,
 )
-from track_fusion.densities.mixture_quotient import laplace, wep_bound, wep_quotient
-from track_fusion.densities.mixture_sampling import Omega, optimise_omega, single_shot_em, weighted_em
 from track_fusion.densities.pooling_weights import chernoff_weights, minimax_weights
 from track_fusion.linalg import Array
 from track_fusion.params import param
 from track_fusion.rules import covariance_intersection
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
-from track_fusion.rules.mixture_common import (
-    Generators,
-    ReductionParams,
-    Step,
-    fold_mixtures,
-    fuse_sampled,
-)
+from track_fusion.rules.mixture_common import Generators, Step, fold_mixtures, fuse_sampled
+from track_fusion.rules.mixture_quotients import QuotientParams, sample_mixands
 from track_fusion.rules.pairwise import share_of_first
 
 
 @dataclasses.dataclass(frozen=True)
-class MixtureWepParams(ReductionParams):
+class MixtureWepParams(QuotientParams):
     """How the exponent omega is chosen and how the product of powers becomes a mixture."""
 
+    method: str = param(
+        "dls",
+        "dls: sample each mixand, igs: sample the whole and share out, is_wem: the same by expectation maximisation, "
+        "foci: first-order approximation, pcci: a covariance intersection of each pair, naive_bayes: the plain product",
+        choices=("dls", "igs", "is_wem", "foci", "pcci", "naive_bayes"),
+    )
     criterion: str = param(
         "chernoff",
         "exponent omega: as far from either density (chernoff), nearest to naive fusion (minimax_information_loss), "
@@ -53,26 +53,12 @@ class MixtureWepParams(ReductionParams):
     weights: tuple[float, ...] = param(
         (), "fusion weights for criterion given, one a source, sum 1", low=0.0, high=1.0, kind=float
     )
-    method: str = param(
-        "dls",
-        "dls: sample each mixand, igs: sample the whole and share out, is_wem: the same by expectation maximisation, "
-        "foci: first-order approximation, pcci: a covariance intersection of each pair, naive_bayes: the plain product",
-        choices=("dls", "igs", "is_wem", "foci", "pcci", "naive_bayes"),
+    omega_proposal: str = param(
+        "overlap",
+        "what the search for omega, igs and is_wem sample from: products of powers of components, weighted by their "
+        "overlap, or without regard to it, as foci and the paper have it (first_order)",
+        choices=("overlap", "first_order"),
     )
-    proposal: str = param(
-        "heavy_tail",
-        "what dls samples from: the naive mean with a component's covariance (ingis), Laplace's approximation (lagis), "
-        "or that with heavy tails (heavy_tail)",
-        choices=("ingis", "lagis", "heavy_tail"),
-    )
-    samples: int = param(1000, "samples for omega, igs and is_wem, in all", low=10)
-    mixand_samples: int = param(100, "samples for dls, each mixand", low=10)
-    default_variance: float = param(
-        0.0, "smallest variance of any axis that ingis samples with, alpha in (52); 0: the components' own", low=0.0,
-        unit="axis unit^2",
-    )  # fmt: skip
-    prune_nats: float = param(14.0, "mixands this far below the largest are not sampled", low=0.0, unit="nat")
-    em_components: int = param(0, "components that is_wem fits; 0: as many as the larger mixture", low=0)
 
 
 def fuse(tracks: SourceTracks, params: MixtureWepParams) -> FusedTracks:
@@ -117,8 +103,7 @@ def fuse(tracks: SourceTracks, params: MixtureWepParams) -> FusedTracks:
 
         return fold_mixtures(piece, params, step, start)
 
-    points = max(params.samples, params.largest_product(tracks) * params.mixand_samples)
-    return fuse_sampled(tracks, points, fuse_piece)
+    return fuse_sampled(tracks, params.points(tracks), fuse_piece)
 
 
 def _fuse_pair(
@@ -127,8 +112,11 @@ def _fuse_pair(
     lead = first.weight.shape[:-1]
     if first.count == second.count == 1 and params.method not in ("pcci", "naive_bayes"):
         return _fuse_gaussians(first, second, params.criterion, share)
+    if params.method == "naive_bayes":
+        return _multiply(first, second)
     given = None if share is None else np.full(lead, share)
-    found = optimise_omega(first, second, rng, params.samples, params.criterion, given)
+    proposal = PROPOSALS[params.omega_proposal](first, second)
+    found = optimise_omega(first, second, rng, params.samples, params.criterion, given, proposal)
     info: dict[str, NDArray[Any]] = {
         "converged": found.converged,
         "iterations": found.iterations,
@@ -136,8 +124,6 @@ def _fuse_pair(
         "log_eta": found.samples.log_eta,
         "pruned": np.zeros(lead),
     }
-    if params.method == "naive_bayes":
-        return Step(product(LogMixture.of(first), LogMixture.of(second)).normalised, None, info)
     # At the ends, and of equal sources, one source is the answer; 1/2 keeps the rest finite there.
     ends = (found.omega == 0.0) | (found.omega == 1.0) | same(first, second)
     inside = found._replace(omega=np.where(ends, 0.5, found.omega))
@@ -145,6 +131,24 @@ def _fuse_pair(
     info |= more
     fused = chosen(ends, chosen(found.omega > 0.0, first, second), fused)
     return Step(fused, None if params.method == "pcci" else found.omega, info)
+
+
+#: What Algorithm 1 draws from.
+PROPOSALS: dict[str, Callable[[Mixture, Mixture], Mixture]] = {
+    "overlap": overlap_proposal,
+    "first_order": lambda first, second: first_order(first, second, np.full(first.weight.shape[:-1], PROPOSAL_OMEGA)),
+}
+
+
+def _multiply(first: Mixture, second: Mixture) -> Step:
+    """Fuse naively: nothing is searched or sampled."""
+    whole = product(LogMixture.of(first), LogMixture.of(second))
+    lead = whole.log_weight.shape[:-1]
+    info: dict[str, NDArray[Any]] = {
+        "converged": np.ones(lead, bool), "iterations": np.zeros(lead, np.intp), "ess": np.ones(lead),
+        "log_eta": log_sum_exp(whole.log_weight), "pruned": np.zeros(lead),
+    }  # fmt: skip
+    return Step(whole.normalised, None, info)
 
 
 def _fuse_gaussians(first: Mixture, second: Mixture, criterion: str, share: float | None) -> Step:
@@ -184,20 +188,12 @@ def _dls(first: Mixture, second: Mixture, found: Omega, params: MixtureWepParams
     # The mixands sum to the whole integral, of which Algorithm 1 has an estimate: one is no less than the mean.
     likely = np.broadcast_to((found.samples.log_eta - np.log(bound.shape[-1]))[..., None], bound.shape)
     kept = prune_mixands(wep_quotient(first, second, found.omega), bound, likely, params.prune_nats)
-    proposal = _proposal(first, second, found.omega, params, kept)
-    local = direct_local_sampling(kept.quotient, proposal, rng, params.mixand_samples)
-    ess = (local.mixture.weight * local.ess).sum(-1) / params.mixand_samples
-    return local.mixture, {"ess": ess, "log_eta": local.log_eta, "pruned": kept.share}
 
+    def wide(near: Laplace) -> Array:
+        above = first_order(first, second, found.omega).cov
+        return np.take_along_axis(above, kept.order[..., None, None], -3)
 
-def _proposal(first: Mixture, second: Mixture, omega: Array, params: MixtureWepParams, kept: Pruned) -> Proposal:
-    if params.proposal == "ingis":
-        return inflated_naive(kept.quotient, first, second, params.default_variance, kept.order)
-    found = laplace(kept.quotient)
-    if params.proposal == "lagis":
-        return laplace_proposals(found)
-    above = first_order(first, second, omega).cov
-    return heavy_tail(found, np.take_along_axis(above, kept.order[..., None, None], -3))
+    return sample_mixands(kept, first, second, lambda: laplace(kept.quotient), wide, params, rng)
 
 
 def _igs(first: Mixture, second: Mixture, found: Omega, params: MixtureWepParams, rng: np.random.Generator) -> Result:
@@ -205,8 +201,7 @@ def _igs(first: Mixture, second: Mixture, found: Omega, params: MixtureWepParams
 
 
 def _em(first: Mixture, second: Mixture, found: Omega, params: MixtureWepParams, rng: np.random.Generator) -> Result:
-    count = params.em_components or max(first.count, second.count)
-    learned = weighted_em(found.samples, count, rng)
+    learned = weighted_em(found.samples, params.learned_count(first, second), rng)
     return learned.mixture, {"converged": found.converged & learned.converged}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from track_fusion.params import unknown_name_error
 from track_fusion.scenarios import (
+    ahmed_random,
     ahmed_search,
     chen2022_dynamic_1,
     chen2022_dynamic_2,
@@ -24,6 +25,7 @@ _MODULES = (
     chen2022_dynamic_1,
     chen2022_dynamic_2,
     li2019_variables,
+    ahmed_random,
     ahmed_search,
     sharma_gaussians,
     sharma_mixtures,

@@ -1,0 +1,91 @@
+"""What mixture_exact and mixture_wep share: how a quotient of mixtures is sampled mixand by mixand."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from track_fusion.densities.mixture import Mixture
+from track_fusion.densities.mixture_proposals import (
+    Pruned,
+    direct_local_sampling,
+    heavy_tail,
+    inflated_naive,
+    laplace_proposals,
+)
+from track_fusion.densities.mixture_quotient import Laplace
+from track_fusion.linalg import Array
+from track_fusion.params import param
+from track_fusion.rules.base import SourceTracks
+from track_fusion.rules.mixture_common import ReductionParams
+
+
+@dataclasses.dataclass(frozen=True)
+class QuotientParams(ReductionParams):
+    """How a quotient of mixtures becomes a mixture, and from how many samples."""
+
+    method: str = param(
+        "dls",
+        "dls: sample each mixand, igs: sample the whole and share out, naive_bayes: the plain product",
+        choices=("dls", "igs", "naive_bayes"),
+    )
+    proposal: str = param(
+        "heavy_tail",
+        "what dls samples from: the naive mean with a component's covariance (ingis), Laplace's approximation (lagis), "
+        "or that with heavy tails (heavy_tail)",
+        choices=("ingis", "lagis", "heavy_tail"),
+    )
+    samples: int = param(1000, "samples in all, for whatever is not sampled mixand by mixand", low=10)
+    mixand_samples: int = param(100, "samples for dls, each mixand", low=10)
+    default_variance: float = param(
+        0.0, "smallest variance of any axis that ingis samples with, alpha in (52); 0: the components' own", low=0.0,
+        unit="axis unit^2",
+    )  # fmt: skip
+    prune_nats: float = param(14.0, "mixands this far below the largest are not sampled", low=0.0, unit="nat")
+    em_components: int = param(
+        0, "components that expectation maximisation fits; 0: as many as the larger mixture", low=0
+    )
+
+    def points(self, tracks: SourceTracks) -> int:
+        """Return the most points that the fusion of two sources samples."""
+        return max(self.samples, self.largest_product(tracks) * self.mixand_samples)
+
+    def learned_count(self, first: Mixture, second: Mixture) -> int:
+        """Return how many components expectation maximisation fits."""
+        return self.em_components or max(first.count, second.count)
+
+
+def sample_mixands(
+    kept: Pruned,
+    first: Mixture,
+    second: Mixture,
+    approximate: Callable[[], Laplace],
+    wide: Callable[[Laplace], Array],
+    params: QuotientParams,
+    rng: np.random.Generator,
+) -> tuple[Mixture, dict[str, NDArray[Any]]]:
+    """Direct local sampling, Algorithm 5, of the mixands kept of the quotient of first and second.
+
+    Parameters
+    ----------
+    kept : Pruned            (..., P) mixands
+    approximate : callable   () -> Laplace's approximation of these mixands, for the proposals that need it
+    wide : callable          it -> covariances (..., P, n, n) of the Gaussians above the mixands, for heavy tails
+    params, rng              proposal, number of samples, generator
+
+    Returns
+    -------
+    Mixture (..., P) of weight 1, and the diagnostics ess, log_eta and pruned (...)
+    """
+    if params.proposal == "ingis":
+        proposal = inflated_naive(kept.quotient, first, second, params.default_variance, kept.order)
+    else:
+        found = approximate()
+        proposal = laplace_proposals(found) if params.proposal == "lagis" else heavy_tail(found, wide(found))
+    local = direct_local_sampling(kept.quotient, proposal, rng, params.mixand_samples)
+    ess = (local.mixture.weight * local.ess).sum(-1) / params.mixand_samples
+    return local.mixture, {"ess": ess, "log_eta": local.log_eta, "pruned": kept.share}
