@@ -1,4 +1,4 @@
-"""Rules mixture_exact and mixture_wep: the random study of Ahmed 5.1, limits, refusals, disjoint mixtures."""
+"""Rules mixture_exact and mixture_wep: random problems of Ahmed 5.1, limits, refusals, disjoint mixtures."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from rules.test_mixture_averages import as_tracks
 from track_fusion.densities.log_domain import normalised
 from track_fusion.densities.mixture import Mixture, log_pdf, moments, sample
 from track_fusion.densities.mixture_algebra import LogMixture, first_order, power, product
-from track_fusion.densities.mixture_divergence import grid, kl_on_grid
 from track_fusion.densities.mixture_sampling import Weighted, single_shot_em
 from track_fusion.linalg import Array
 from track_fusion.params import from_dict
 from track_fusion.rules import FusedTracks, SourceTracks, get_rule, mixture_common
+from track_fusion.scenarios.ahmed_mixtures import Problem, divergence, log_fused
+from track_fusion.scenarios.ahmed_random import study_problem
 
 
 def run(key: str, tracks: SourceTracks, **values: Any) -> FusedTracks:
@@ -25,112 +26,47 @@ def run(key: str, tracks: SourceTracks, **values: Any) -> FusedTracks:
     return rule(tracks, from_dict(rule.params, values))
 
 
-# The random problems of Ahmed 5.1; about fifteen seconds of processor time.
-
-PROBLEMS = 20
-GRID = grid(np.full(2, -28.0), np.full(2, 28.0), 100)
-
-
-def _random_mixture(rng: np.random.Generator, count: int, half: float) -> Mixture:
-    """Weights uniform, means uniform within the square, covariances Wishart(10, .75 I), of mean 7.5 I."""
-    weight, root = rng.random(count), rng.normal(size=(count, 2, 10)) * np.sqrt(0.75)
-    return Mixture(weight / weight.sum(), rng.uniform(-half, half, (count, 2)), root @ np.swapaxes(root, 1, 2))
-
-
-@dataclasses.dataclass
-class Problem:
-    tracks: SourceTracks
-    first: Mixture
-    second: Mixture
-    log_exact: Array
-
-    @classmethod
-    def of(cls, seed: int) -> Problem:
-        rng = np.random.default_rng(seed)
-        first, second = _random_mixture(rng, 10, 14.0), _random_mixture(rng, 10, 14.0)
-        common = _random_mixture(rng, 40, 20.0)
-        both = Mixture(*(np.stack(arrays) for arrays in zip(vars(first).values(), vars(second).values(), strict=True)))
-        logs = [log_pdf(m, GRID) for m in (first, second, common)]
-        tracks = dataclasses.replace(as_tracks(both), extras={"common": common, "seed": 1})
-        return cls(tracks, first, second, logs[0] + logs[1] - logs[2])
-
-    def exact(self, **values: Any) -> float:
-        fused = run("mixture_exact", self.tracks, max_components=0, **values)
-        assert fused.mixture is not None
-        return self.far(self.log_exact, fused.mixture)
-
-    def far(self, log_truth: Array, fused: Mixture) -> float:
-        return kl_on_grid(lambda x: log_truth, lambda x: log_pdf(fused, x), GRID)
+# The random problems of Ahmed 5.1. The study itself: test/library/test_scenario_ahmed_mixtures.py.
 
 
 @pytest.fixture(scope="module")
 def problems() -> list[Problem]:
-    return [Problem.of(seed) for seed in range(PROBLEMS)]
+    return [study_problem(0, run) for run in range(6)]
 
 
-def test_random_study_of_exact_fusion(problems: list[Problem]) -> None:
-    def median(among: int = PROBLEMS, **values: Any) -> float:
-        return float(np.median([p.exact(**values) for p in problems[:among]]))
-
-    ingis = {"method": "dls", "proposal": "ingis", "default_variance": 5.0}
-    dls = [median(**ingis, mixand_samples=s) for s in (10, 50, 200)]
-    igs = [median(method="igs", samples=s) for s in (100, 500, 1000)]
-    mmgd = median(method="mmgd")
-    assert dls[2] <= 0.03
-    assert igs[2] <= 0.06
-    assert mmgd >= 10 * dls[2]
-    assert dls == sorted(dls, reverse=True)  # more samples are always better
-    assert igs == sorted(igs, reverse=True)
-    assert median(mixand_samples=200) <= dls[2]  # heavy tails, the default
-    assert dls[2] < median(method="laplace") < mmgd
-    assert median(5, method="common_proposal", samples=2000, em_components=10) > 5 * dls[2]
-
-
-def test_random_study_of_weighted_exponential_products(problems: list[Problem]) -> None:
-    far: dict[str, list[float]] = {}
+def _median(problems: list[Problem], **values: Any) -> float:
+    """Median divergence of the exactly fused density from what the rule gives."""
+    far = []
     for p in problems:
-        base = {"criterion": "minimax_information_loss", "max_components": 0}
-        omega = run("mixture_wep", p.tracks, **base, method="foci", samples=5000).weights
-        assert omega is not None
-        w = np.array(omega[0])
-        log_truth = w * log_pdf(p.first, GRID) + (1 - w) * log_pdf(p.second, GRID)
-        given = {"criterion": "given", "weights": tuple(omega), "max_components": 0}
-        cases = {
-            "dls": {"proposal": "ingis", "default_variance": 5.0, "mixand_samples": 200},
-            "igs100": {"method": "igs", "samples": 100}, "igs1000": {"method": "igs", "samples": 1000},
-            "foci": {"method": "foci"}, "naive": {"method": "naive_bayes"},
-        }  # fmt: skip
-        for name, values in cases.items():
-            fused = run("mixture_wep", p.tracks, **given, **values).mixture
-            assert fused is not None
-            far.setdefault(name, []).append(p.far(log_truth, fused))
-        far.setdefault("igs100 by foci", []).append(p.far(log_truth, _igs_by_first_order(p, w, 100)))
-    median = {name: float(np.median(values)) for name, values in far.items()}
-    assert median["dls"] <= 0.012
-    assert median["igs1000"] <= 0.06
-    assert median["foci"] >= 5 * median["igs1000"]
-    # With the paper's proposal a hundred samples are worse than none. The rule's counts overlaps and does better.
-    assert median["igs100 by foci"] > median["foci"]
-    assert median["igs100"] < 0.9 * median["igs100 by foci"]
-    assert median["dls"] < median["igs1000"] < median["naive"]
+        fused = run("mixture_exact", p.tracks(np.random.default_rng(1)), max_components=0, **values)
+        far.append(divergence(p.log_exact(), log_fused(fused)))
+    return float(np.median(far))
 
 
-def _igs_by_first_order(p: Problem, omega: Array, count: int) -> Mixture:
-    """Indirect global sampling from (14)-(17) at omega 1/2, as printed."""
-    proposal = first_order(p.first, p.second, np.array(0.5))
-    points = sample(proposal, np.random.default_rng(1), count).points
-    weight = omega * log_pdf(p.first, points) + (1 - omega) * log_pdf(p.second, points) - log_pdf(proposal, points)
-    return single_shot_em(Weighted(points, weight), product(LogMixture.of(p.first), LogMixture.of(p.second)))
+def test_the_default_method_is_the_most_accurate(problems: list[Problem]) -> None:
+    best = _median(problems, mixand_samples=200)
+    assert best <= 0.03
+    assert best <= _median(problems, mixand_samples=200, proposal="ingis", default_variance=5.0)
+    laplace = _median(problems, method="laplace")
+    assert best < laplace < _median(problems, method="mmgd")
+    assert _median(problems, method="common_proposal", samples=2000, em_components=10) > 5 * best
 
 
-def test_effective_samples_grow_from_ingis_to_heavy_tails(problems: list[Problem]) -> None:
-    """Example 2 of Ahmed: the order of the mean share of effective samples is robust, that of divergences is not."""
-    ess = [
-        np.mean([run("mixture_exact", p.tracks, proposal=kind, mixand_samples=500).info["ess"] for p in problems[:6]])
-        for kind in ("ingis", "lagis", "heavy_tail")
-    ]
-    assert ess[0] < ess[1]
-    assert ess[0] < ess[2]
+def test_printed_proposal_of_algorithm_1_needs_more_samples(problems: list[Problem]) -> None:
+    """Also callable by itself: what the parameter says is what the algorithms give."""
+    p, rng = problems[0], np.random.default_rng(5)
+    printed = {"criterion": "given", "weights": (0.4, 0.6), "omega_proposal": "first_order", "max_components": 0}
+    got = run("mixture_wep", p.tracks(rng), method="igs", samples=300, **printed)
+    drawn = first_order(p.first, p.second, np.array(0.5))
+    seed = np.random.default_rng(5).integers(1 << 63, size=1)[0]
+    points = sample(drawn, np.random.default_rng(seed), 300).points
+    weight = 0.4 * log_pdf(p.first, points) + 0.6 * log_pdf(p.second, points) - log_pdf(drawn, points)
+    naive = product(LogMixture.of(p.first), LogMixture.of(p.second))
+    mean, cov = moments(single_shot_em(Weighted(points, weight), naive))
+    np.testing.assert_allclose(got.mean, mean, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(got.cov, cov, rtol=1e-9, atol=1e-9)
+    ours = run("mixture_wep", p.tracks(rng), method="igs", samples=300, **(printed | {"omega_proposal": "overlap"}))
+    assert ours.info["ess"] > 1.3 * got.info["ess"]
 
 
 # Limits.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from track_fusion.params import unknown_name_error
 from track_fusion.scenarios import (
+    ahmed_proposals,
     ahmed_random,
     ahmed_search,
     chen2022_dynamic_1,
@@ -26,6 +27,7 @@ _MODULES = (
     chen2022_dynamic_2,
     li2019_variables,
     ahmed_random,
+    ahmed_proposals,
     ahmed_search,
     sharma_gaussians,
     sharma_mixtures,

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from track_fusion.densities.log_domain import normalised
 from track_fusion.densities.mixture import Mixture, log_pdf, moments, stacked
 from track_fusion.densities.mixture_divergence import grid, kl_on_grid
+from track_fusion.densities.mixture_quotient import exact_bound, exact_quotient
 from track_fusion.linalg import Array, transpose
 from track_fusion.params import ParameterError
 from track_fusion.random_streams import stream
@@ -27,10 +30,13 @@ INGIS_VARIANCE = 5.0
 #: Fused densities are known on a grid of so many cells a side, over the square within this distance of the origin.
 CELLS, GRID_HALF = 100, 28.0
 GRID = grid(np.full(2, -GRID_HALF), np.full(2, GRID_HALF), CELLS)
+CELL_AREA = (2.0 * GRID_HALF / CELLS) ** 2
 #: What pictures show of it.
-SHOWN_HALF = 18.0
+SHOWN_HALF = 20.0
 #: Contours are drawn at these shares of the true density's peak.
 LEVELS = (0.03, 0.1, 0.3, 0.7)
+#: Pictures end where nothing reaches this share.
+FAINTEST = 0.003
 
 
 def random_mixture(rng: np.random.Generator, count: int, half: float) -> Mixture:
@@ -56,9 +62,15 @@ class Problem:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator, sources: Sequence[int], common: Sequence[int]) -> Problem:
-        """Draw a problem whose numbers of components are among those given."""
-        first, second = (random_mixture(rng, int(rng.choice(sources)), SOURCE_HALF) for _ in range(2))
-        return cls(first, second, random_mixture(rng, int(rng.choice(common)), COMMON_HALF))
+        """Draw a problem whose numbers of components are among those given, until one is that surely has a solution.
+
+        That is: each mixand of the exact quotient falls below a Gaussian, (55).
+        """
+        while True:
+            first, second = (random_mixture(rng, int(rng.choice(sources)), SOURCE_HALF) for _ in range(2))
+            shared = random_mixture(rng, int(rng.choice(common)), COMMON_HALF)
+            if exact_bound(exact_quotient(first, second, shared), shared).sure.all():
+                return cls(first, second, shared)
 
     def tracks(self, rng: np.random.Generator) -> SourceTracks:
         """Return what a rule takes; `rng` is for those that sample."""
@@ -86,29 +98,38 @@ def log_fused(fused: FusedTracks) -> Array:
     return log_pdf(Mixture(np.ones(1), fused.mean[None], fused.cov[None]), GRID)
 
 
-def shown(log_density: Array) -> Array:
+def shown(log_density: Array) -> NDArray[np.float32]:
     """Cut what pictures show out of a density on GRID, (CELLS^2,) -> (P, P), rows along the second axis."""
-    cells = normalised(log_density).reshape(CELLS, CELLS) / (2.0 * GRID_HALF / CELLS) ** 2
+    cells = normalised(log_density).reshape(CELLS, CELLS) / CELL_AREA
     inside = np.abs(_centres()) < SHOWN_HALF
-    return np.asarray(cells[np.ix_(inside, inside)].T)
+    return cells[np.ix_(inside, inside)].T.astype(np.float32)
 
 
 def _centres() -> Array:
     return GRID.reshape(CELLS, CELLS, 2)[:, 0, 0]
 
 
-def contour_chart(title: str, densities: dict[str, Array]) -> Chart:
-    """Draw densities as `shown` gives them, all at the same levels, shares of the first one's peak."""
+def contour_chart(title: str, densities: Mapping[str, NDArray[Any]]) -> Chart:
+    """Draw densities as `shown` gives them, all at the same levels, shares of the first one's peak.
+
+    The first one's label is to say what it is; the others' what they approximate it by.
+    """
     axis = _centres()[np.abs(_centres()) < SHOWN_HALF]
-    peak = next(iter(densities.values())).max()
-    levels = tuple(float(share * peak) for share in LEVELS)
-    drawn = [Contours(label, axis, axis, _rounded(z / peak) * peak, levels) for label, z in densities.items()]
+    peak = float(next(iter(densities.values())).max())
+    # Rounded to what can be seen, to keep a report small.
+    shares = {label: np.round(np.asarray(z, float) / peak, 4) for label, z in densities.items()}
+    used = np.any([share >= FAINTEST for share in shares.values()], 0)
+    rows, columns = (_range(used.any(1 - axis)) for axis in range(2))
+    drawn = [Contours(name, axis[columns], axis[rows], z[rows, columns], LEVELS) for name, z in shares.items()]
+    percent = ", ".join(f"{level:.0%}" for level in LEVELS)
+    drawn[0] = dataclasses.replace(drawn[0], label=f"{drawn[0].label}: {percent} of its peak")
     return Chart(title, "first axis", "second axis", contours=tuple(drawn), equal=True)
 
 
-def _rounded(share: Array) -> Array:
-    """Keep as much of a picture as can be seen."""
-    return np.round(share, 4)
+def _range(used: NDArray[np.bool_]) -> slice:
+    """Return where all that is used lies."""
+    at = np.flatnonzero(used)
+    return slice(int(at[0]), int(at[-1]) + 1)
 
 
 def compare(
