@@ -13,6 +13,9 @@ from scipy.special import ndtr
 from track_fusion.linalg import Array, matvec, outer
 from track_fusion.optimise import Solution, minimise_on_simplex
 
+#: Stands for the logarithm of zero: times a weight of zero it is zero, times any other it has the exponential zero.
+LOG_OF_NOTHING = -1e300
+
 
 def arithmetic_average(values: Array, weights: Array) -> Array:
     """Weighted arithmetic average (6): (..., K), (..., K) -> (...).
@@ -22,7 +25,7 @@ def arithmetic_average(values: Array, weights: Array) -> Array:
     ValueError    the weights are negative or do not sum to 1
     """
     _check_weights(weights)
-    return np.asarray((weights * values).sum(-1))
+    return np.asarray(np.einsum("...k,...k->...", weights, values))
 
 
 def geometric_average(values: Array, weights: Array) -> Array:
@@ -35,9 +38,9 @@ def geometric_average(values: Array, weights: Array) -> Array:
     _check_weights(weights)
     if (values < 0).any():
         raise ValueError(f"The geometric average takes values that are not negative. Got {values.min()}.")
-    with np.errstate(divide="ignore", invalid="ignore"):
-        logs = np.where(weights > 0, weights * np.log(values), 0.0)
-    return np.asarray(np.exp(logs.sum(-1)))
+    with np.errstate(divide="ignore"):
+        logs = np.where(values == 0, LOG_OF_NOTHING, np.log(values))
+    return np.asarray(np.exp(np.einsum("...k,...k->...", weights, logs)))
 
 
 # Moments of the averages.

@@ -128,7 +128,7 @@ def test_claims_of_the_paper_that_do_not_hold(measured):
     assert {source for source, _ in false} == {
         "6, v-fusion, conclusion 2", "Remark 3", "sentence after (26)", "(19)-(20)",
     }  # fmt: skip
-    assert {claim for source, claim in false if source == "Remark 3"} == {"parameter 45"}
+    assert {claim for source, claim in false if source == "Remark 3"} == {"Parameter 45"}
     assert sum(c["verdict"] != "agrees" for c in judged_claims(SCENARIO, measured)) == 6
 
 

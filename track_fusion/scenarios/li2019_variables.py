@@ -135,7 +135,10 @@ def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -
 
 def _moments(values: Array, geometric: bool, origin: float) -> Array:
     """First and second moment about the origin of an average at all weights, (2, W)."""
-    mean, variance = average_moments(values, np.full(len(values), 1.0 / len(values)), WEIGHTS, geometric)
+    if geometric:
+        mean, variance = average_moments(values, np.full(len(values), 1.0 / len(values)), WEIGHTS, True)
+    else:
+        mean, variance = arithmetic_moments(values.mean(0), np.cov(values.T, bias=True), WEIGHTS)
     return np.stack([mean - origin, variance + (mean - origin) ** 2])
 
 
@@ -268,15 +271,15 @@ def _error_claims(truth: int) -> tuple[Claim, Claim]:
     shares = tuple(f"{AA}@{v}/greater_share_mse_theta{truth}_1" for v in ("rho0", "rho70736"))
     return (
         Claim(
-            f"parameter {truth}: the mean square error of the arithmetic average is greater than that of the "
-            "geometric at some weights and smaller at others",
+            f"Parameter {truth}: the mean square error of the arithmetic average is greater than that of the "
+            "geometric at some weights and smaller at others.",
             "Remark 3",
             shares,
             _some_of_both,
         ),
         Claim(
-            f"parameter {truth}: the least mean square error of the arithmetic average is no greater than that of "
-            "the geometric",
+            f"Parameter {truth}: the least mean square error of the arithmetic average is no greater than that of "
+            "the geometric.",
             "Remark 3",
             _pairs(("rho0", "rho70736"), f"least_mse_theta{truth}_1"),
             _no_greater,
@@ -286,67 +289,67 @@ def _error_claims(truth: int) -> tuple[Claim, Claim]:
 
 CLAIMS = (
     Claim(
-        "averages of unbiased variables: the arithmetic average is unbiased (mean 55 at equal weights)",
+        "The arithmetic average of unbiased variables is unbiased (mean 55 at equal weights).",
         "3.1, (12)",
         (f"{AA}@rho0/mean_half_1",),
         lambda mean: abs(mean.value - MEAN.mean()) <= 3.0 * mean.standard_error,
     ),
     Claim.order(
-        "the mean of the geometric average is below that of the arithmetic",
+        "The mean of the geometric average is below that of the arithmetic.",
         "3.1",
         f"{GA}@rho0/mean_half_1",
         f"{AA}@rho0/mean_half_1",
     ),
     Claim(
-        "below the correlation (22) some weights give the arithmetic average less variance than either variable",
+        "Below the correlation (22) some weights give the arithmetic average less variance than either variable.",
         "Remark 1",
         tuple(f"{AA}@{v}/{q}" for q in ("least_variance_1", "better_variance_1") for v in ("rho0", "rho60")),
         lambda *e: e[0].value < e[2].value and e[1].value < e[3].value,
     ),
     Claim(
-        "above it, at 0.70846, the least variance is that of the better variable",
+        "Above it, at 0.70846, the least variance is that of the better variable.",
         "(21), Fig. 1",
         (f"{AA}@rho70846/least_variance_1", f"{AA}@rho70846/better_variance_1"),
         lambda least, better: abs(least.value / better.value - 1.0) <= 1e-3,
     ),
     *(
         Claim(
-            f"{kind} variables: the arithmetic average has more variance at some weights, the geometric at others",
+            f"{kind} variables: the arithmetic average has more variance at some weights, the geometric at others.",
             f"Remark 2, {figure}",
             tuple(f"{AA}@{v}/greater_share_variance_1" for v in variants),
             _some_of_both,
         )
-        for kind, figure, variants in (("normal", "Fig. 1", FIGURE_1), ("Poisson", "Fig. 2", FIGURE_2))
+        for kind, figure, variants in (("Normal", "Fig. 1", FIGURE_1), ("Poisson", "Fig. 2", FIGURE_2))
     ),
     Claim(
-        "the least variance of the arithmetic average is no greater than that of the geometric, in Figs. 1 and 2",
+        "In Figs. 1 and 2 the least variance of the arithmetic average is no greater than that of the geometric.",
         "Remark 2",
         _pairs(FIGURE_1 + FIGURE_2, "least_variance_1"),
         _no_greater,
     ),
     Claim(
-        "so it is for any two variables (counter-example: two independent lognormal variables of log-variance 1)",
+        "So it is for any two variables (here two independent lognormal ones of log-variance 1).",
         "6, v-fusion, conclusion 2",
         _pairs(("lognormal",), "least_variance_1"),
         _no_greater,
     ),
     *(claim for truth in TRUTHS for claim in _error_claims(truth)),
     Claim(
-        "a parameter between the two means makes the correlation of the errors negative or zero (here 55, correlation "
-        "0.70736)",
+        "A parameter between the two means makes the correlation of the errors negative or zero (here 55, correlation "
+        "0.70736).",
         "sentence after (26)",
         (f"{AA}@theta55/beta_1",),
         lambda beta: beta.value <= 0.0,
     ),
     Claim(
-        "a parameter on or between the two means always fulfils (26) (here 50, correlation 0.70736)",
+        "A parameter on or between the two means always fulfils (26) (here 50, correlation 0.70736).",
         "sentence after (26)",
         (f"{AA}@theta50/beta_1", f"{AA}@theta50/limit_26_1"),
         lambda beta, limit: beta.value < limit.value,
     ),
     Claim(
-        "a correlation below ratio^(-1/2) gives weights (19) between 0 and 1, at which (20) is the least variance "
-        "(here variances 200 and 100, correlation 0.8; both need a correlation below ratio^(1/2), too)",
+        "A correlation below ratio^(-1/2) gives weights (19) between 0 and 1, at which (20) is the least variance "
+        "(here variances 200 and 100, correlation 0.8; both need a correlation below ratio^(1/2), too).",
         "(19)-(20)",
         tuple(f"{AA}@swapped/{q}" for q in ("weight_19_1", "bound_20_1", "least_variance_1")),
         lambda weight, bound, least: 0 < weight.value < 1 and abs(bound.value - least.value) < 1e-6 * least.value,
