@@ -8,8 +8,8 @@ from collections import defaultdict
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
+from track_fusion.association.assignment import nearest_pairs
 from track_fusion.chi_square import chi_square_quantile
 from track_fusion.linalg import Array
 from track_fusion.metrics.consistency import Consistency, consistency, consistency_of_sum, nees
@@ -76,10 +76,7 @@ class Evaluation:
         true_state = truth.moments[0]
         mean, cov = tracks.moments
         at = list(self._layout.position)
-        distance = np.linalg.norm(true_state[:, None, at] - mean[None][..., at], axis=-1)
-        target, track = linear_sum_assignment(np.minimum(distance, self._params.max_distance_m))
-        near = distance[target, track] < self._params.max_distance_m
-        target, track = target[near], track[near]
+        target, track = nearest_pairs(true_state[:, at], mean[:, at], self._params.max_distance_m)
         error = mean[track] - true_state[target]
         turned = self._layout.angular
         error[:, turned] = np.remainder(error[:, turned] + np.pi, 2 * np.pi) - np.pi

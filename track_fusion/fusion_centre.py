@@ -84,6 +84,7 @@ class FusionCentre:
     params : FusionCentreParams
     rule_params : Params               of the rule `params.state_fusion`; None = its defaults
     manager_params : TrackManagerParams
+    rule : Rule                        in place of the one that `params` names: one that the registry learned later
 
     Raises
     ------
@@ -98,10 +99,11 @@ class FusionCentre:
         params: FusionCentreParams,
         rule_params: Params | None = None,
         manager_params: TrackManagerParams | None = None,
+        rule: Rule | None = None,
     ) -> None:
         self.params = params
         self.layout, self.frame_id, self._motion = motion.layout, frame_id, motion
-        self.rule: Rule = RULES[params.state_fusion]
+        self.rule = RULES[params.state_fusion] if rule is None else rule
         self._rule_params = self.rule.params() if rule_params is None else rule_params
         if needed := self.rule.needed(self._rule_params):
             raise ParameterError(

@@ -87,3 +87,20 @@ def nearest_neighbour(
     """Gate and assign in one call; arguments as for `gate`, the result as for `assign`."""
     found = gate(row_mean, row_cov, col_mean, col_cov, gamma, position)
     return assign(found, len(row_mean), len(col_mean), gamma)
+
+
+def nearest_pairs(first: Array, second: Array, reach: float) -> tuple[Indices, Indices]:
+    """Pair points one to one by least total distance, none farther apart than `reach`.
+
+    Parameters
+    ----------
+    first, second : (M, d), (N, d)    without NaN
+
+    Returns
+    -------
+    row, col : (P,) each, ascending rows
+    """
+    distance = np.linalg.norm(first[:, None] - second[None], axis=-1)
+    row, col = linear_sum_assignment(np.minimum(distance, reach))
+    near = distance[row, col] < reach
+    return row[near], col[near]

@@ -19,6 +19,7 @@ from track_fusion.scenarios import (
     sharma_mixtures,
     sharma_network_1,
     sharma_network_2,
+    sharma_radars,
     sharma_scalar,
 )
 from track_fusion.scenarios.base import Claim, RuleChoice, Samples, Scenario, Tracking, judged_claims, judged_figures
@@ -40,6 +41,7 @@ _MODULES = (
     sharma_scalar,
     sharma_network_1,
     sharma_network_2,
+    sharma_radars,
 )
 
 SCENARIOS: dict[str, Scenario] = {module.SCENARIO.key: module.SCENARIO for module in _MODULES}

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from decimal import Decimal
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from track_fusion.models.noise import Noise
 from track_fusion.params import ParameterError, Params, unknown_name_error
 from track_fusion.report.chart import Chart
 from track_fusion.rules import RULES, Rule, SourceTracks
+from track_fusion.tracks import StateLayout
 
 T = TypeVar("T")
 
@@ -88,6 +89,35 @@ class Tracking:
         return found
 
 
+class Scene(Protocol):
+    """Any number of targets, and sensors that miss and invent: what the replay node publishes scan by scan."""
+
+    @property
+    def layout(self) -> StateLayout:
+        """Axes of the true states, n."""
+
+    @property
+    def dt_s(self) -> float:
+        """Seconds from scan to scan, the same for all sensors."""
+
+    @property
+    def steps(self) -> int:
+        """Number of scans of a whole run, the first one `dt_s` after the start."""
+
+    @property
+    def sensors(self) -> Mapping[str, Sensor]:
+        """Sensors by name."""
+
+    def truth(self, seed: int, run: int, steps: int | None = None) -> Array:
+        """Return the states at steps 0 to T, (T + 1, N, n), NaN where a target does not exist.
+
+        T is `steps`, the scene's own number by default; the first states do not depend on it.
+        """
+
+    def detections(self, seed: int, run: int, steps: int | None = None) -> dict[str, list[Array]]:
+        """Draw each sensor's scans 1 to T, (D_k, m) each; the first scans do not depend on T."""
+
+
 @dataclasses.dataclass(frozen=True)
 class RuleChoice:
     """A rule with the parameters that a scenario gives it, and the name of the variant ("" = the paper's)."""
@@ -156,7 +186,8 @@ class Scenario:
     charts : callable          Samples -> list of Chart
     claims : tuple of Claim
     piece : int                so many runs are worked on at once
-    tracking : Tracking | None what the ROS nodes run; None = library only
+    tracking : Tracking | None what the ROS nodes run, one target; None = library only, unless there is a scene
+    scene : callable | None    makes the Scene that the ROS nodes run, many targets
     rules : tuple              the rules it compares, with their parameters
     compare : callable | None  (rules, runs, seed, progress) -> Samples, (R,) each, named as figures are: one number a
                                run for any rules; None = the scenario fuses no tracks
@@ -177,6 +208,7 @@ class Scenario:
     claims: tuple[Claim, ...] = ()
     piece: int = 100
     tracking: Tracking | None = None
+    scene: Callable[[], Scene] | None = None
     rules: tuple[RuleChoice, ...] = ()
     compare: Callable[[Sequence[RuleChoice], Sequence[int], int, Progress], Samples] | None = None
 
