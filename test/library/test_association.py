@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from track_fusion.association import assignment
 from track_fusion.association import gate as gating
-from track_fusion.association.assignment import assign, nearest_neighbour
+from track_fusion.association.assignment import assign, nearest_neighbour, nearest_pairs
 from track_fusion.association.boxes import points_in_boxes
 from track_fusion.association.gate import Candidates, gate
 
@@ -198,3 +198,22 @@ def test_sides_belong_to_a_box_and_points_may_coincide(seed):
     half = rng.integers(0, 3, (boxes, 2))
     wanted = np.argwhere((np.abs(points[None] - centre[:, None]) <= half[:, None]).all(-1)).reshape(-1, 2)
     np.testing.assert_array_equal(np.stack(points_in_boxes(points, centre - half, centre + half), 1), wanted)
+
+
+# ---- points in pairs ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_nearest_pairs_have_the_least_total_distance_with_a_miss_at_reach(seed):
+    rng = np.random.default_rng(seed)
+    first, second = rng.uniform(0, 4, (rng.integers(0, 5), 2)), rng.uniform(0, 4, (rng.integers(0, 5), 2))
+    row, col = nearest_pairs(first, second, 1.5)
+    assert len(set(row)) == len(set(col)) == len(row)
+    taken = np.linalg.norm(first[row] - second[col], axis=1)
+    assert (taken < 1.5).all()
+    few, many = sorted((first, second), key=len)
+    best = min(
+        sum(min(np.linalg.norm(few[i] - many[j]), 1.5) for i, j in enumerate(order))
+        for order in itertools.permutations(range(len(many)), len(few))
+    )
+    assert taken.sum() + 1.5 * (len(few) - len(row)) == pytest.approx(best)

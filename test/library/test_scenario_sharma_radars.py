@@ -187,7 +187,7 @@ def test_compare_pools_all_judged_targets_from_the_settled_time_on(quiet):
 
 def test_a_rule_that_needs_more_than_tracks_is_refused():
     choice = RuleChoice("split_covariance_intersection", SplitCovarianceIntersectionParams())
-    with pytest.raises(ParameterError, match="must be a rule that needs only tracks"):
+    with pytest.raises(ParameterError, match="beside the tracks"):
         SCENARIO.compare([choice], [0], 0, lambda share: None)
 
 

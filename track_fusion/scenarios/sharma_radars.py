@@ -12,7 +12,7 @@ from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.report.chart import Chart, Series
 from track_fusion.rules import RULES
-from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, Scenario, chosen
+from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, Scenario, check_needs, chosen
 from track_fusion.scenarios.sharma_radar_runs import (
     CATEGORIES,
     COLUMNS,
@@ -181,6 +181,7 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
     ------
     ParameterError    a rule needs more than tracks
     """
+    check_needs(rules)
     table = records(tracked({f"pda-{choice.name}": choice for choice in rules}, runs, seed, progress))
     targets = np.concatenate([category(c) for c in CATEGORIES])
     found: Samples = {}
