@@ -12,6 +12,7 @@ from track_fusion.scenarios import (
     li2019_densities,
     li2019_mixture,
     li2019_six_sensors,
+    chen2022_static,
     li2019_variables,
     li2022_linear,
     li2022_nonlinear,
@@ -27,6 +28,7 @@ from track_fusion.scenarios.base import Claim, RuleChoice, Samples, Scenario, Tr
 _MODULES = (
     li2022_linear,
     li2022_nonlinear,
+    chen2022_static,
     chen2022_dynamic_1,
     chen2022_dynamic_2,
     li2019_variables,

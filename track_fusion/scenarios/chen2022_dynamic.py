@@ -21,7 +21,6 @@ from track_fusion.models.base import Sensor, Transition
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.noise import Noise
-from track_fusion.params import ParameterError
 from track_fusion.report.chart import Chart, Series
 from track_fusion.rules import RULES, FusedTracks, SourceTracks
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
@@ -30,7 +29,7 @@ from track_fusion.rules.geodesic_projection import GeodesicProjectionParams
 from track_fusion.rules.mhdp_explicit import MhdpExplicitParams
 from track_fusion.rules.mhdp_iterative import MhdpIterativeParams
 from track_fusion.rules.quasi_minimal_manhattan import QuasiMinimalManhattanParams
-from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, Scenario, Tracking, chosen
+from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, Scenario, Tracking, check_needs, chosen
 from track_fusion.tracks import StateLayout
 
 #: Degrees of freedom of all densities, and covariance over scatter.
@@ -134,7 +133,7 @@ ASSUMPTIONS = (
     "least sum of squared minimal Manhattan distances",
     "MHDP minimises the sum of squared distances; @unsquared: that of the distances, as printed",
     "the parameters of the mixture filter (gstm) are not in the paper: ordering only. Prediction and measurement noise "
-    "are Gaussian with a probability of prior Beta(a, b), else t(3) with the same nominal matrix, by variational Bayes; "
+    "are Gaussian with a probability of prior Beta(a, b), else t(3) with the same nominal matrix (variational Bayes); "
     "assumed: a = 0.85, b = 0.15; its posterior covariance is taken as the scatter of a t(3) density",
     "both filters meet the same truth and the same draws; the outliers of the sensors have 200 times the variance for "
     "the Student-t filter, 100 times for the mixture filter, as printed",
@@ -189,10 +188,7 @@ def compared(
     ------
     ParameterError    a rule needs more than the tracks
     """
-    for choice in choices:
-        if needed := RULES[choice.key].needed(choice.params):
-            raise ParameterError(f"The 'rules' parameter must be rules that need only tracks. Got '{choice.name}', "
-                                 f"which needs '{needed[0]}' as well.")  # fmt: skip
+    check_needs(choices)
     found = squared_errors(base, rows(choices), runs, seed, progress)
     return {f"{row}/position_rmse_m": np.sqrt(squares.mean(1)) for row, squares in found.items()}
 
