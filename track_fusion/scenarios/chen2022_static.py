@@ -200,8 +200,8 @@ CLAIMS = (
              "dof", STUDENT, UNSQUARED, "rao_distance_1"),
     _nearest("generalised Gaussians: MHDP-E, by the distances as printed, is nearest to the informative barycenter "
              "whatever the shape", GENERALIZED, UNSQUARED, "rao_distance_1"),
-    _nearest("all families: MHDP-E, by squared distances, is nearer to the geodesic than FCI, KLA, GP, QMMHD (DCI is an "
-             "end of it)", tuple(SETTINGS), MHDP_E, "geodesic_distance_1", OTHERS[1:]),
+    _nearest("all families: MHDP-E, by squared distances, is nearer to the geodesic than FCI, KLA, GP, QMMHD (DCI is "
+             "an end of it)", tuple(SETTINGS), MHDP_E, "geodesic_distance_1", OTHERS[1:]),
     Claim(
         "MHDP-I and MHDP-E fuse to the same density", "5.1",
         tuple(f"{row_name(choice, name)}/rao_distance_1" for name in SETTINGS for choice in (MHDP_E, MHDP_I)),
