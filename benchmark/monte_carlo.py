@@ -27,7 +27,7 @@ def run() -> Iterator[Result]:
         weight = 0.5 if choice.variant == "uniform" else None
 
         def study(choice=choice):
-            return list(fused_filters(choice, seen))
+            return [fused.mean for fused in fused_filters(choice, seen)]
 
         def loop(weight=weight):
             return two_filters_and_intersection_looped(

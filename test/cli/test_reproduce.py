@@ -99,7 +99,8 @@ def test_the_linear_scenario_as_json() -> None:
         assert NAME.match(name), name
         assert list(figure) == ["name", "value", "standard_error", "published", "verdict"]
         assert figure["verdict"] in VERDICTS
-        assert 0 < figure["standard_error"] < 0.2 * figure["value"]
+        if "armse" in name:  # what a filter claims may be the same in every run
+            assert 0 < figure["standard_error"] < 0.2 * figure["value"]
         assert (figure["verdict"] == "not given") == (figure["published"] is None)
     assert figures["kf-alone/position_armse_m"]["verdict"] == "agrees"
     assert figures["kf-ic/position_armse_m"]["verdict"] == "agrees"

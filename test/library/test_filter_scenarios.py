@@ -5,9 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from track_fusion.metrics.accuracy import armse
 from track_fusion.scenarios import li2022_linear, li2022_nonlinear
-from track_fusion.scenarios.one_target import Sample, drawn, gaussian_fusions, squared_errors
+from track_fusion.scenarios.one_target import Sample, drawn
 
 RUNS = 100
 #: sd of one 100-run table, position, from 500 runs of our own times sqrt(5).
@@ -20,37 +19,41 @@ CKF = {
 
 
 def study(module, rows, runs, seed):
-    errors = squared_errors(module.TRACKING, rows, module.QUANTITIES, range(runs), seed, lambda share: None)
-    return {name: armse(squares) for name, squares in errors.items()}
+    part = dataclasses.replace(module.STUDY, rows={n: module.STUDY.rows[n] for n in rows})
+    return part.figures(part.sample(range(runs), seed, lambda share: None))
 
 
 @pytest.fixture(scope="module")
 def nonlinear():
-    rows = {name: row for name, row in li2022_nonlinear.rows().items() if name in CKF}
-    return study(li2022_nonlinear, rows, RUNS, 7)
+    return study(li2022_nonlinear, (*CKF, "ckf-covariance_union"), RUNS, 7)
 
 
 @pytest.mark.parametrize("row", CKF)
 def test_cubature_rows_of_table_2(nonlinear, row):
     for quantity, (wanted, sd) in zip(li2022_nonlinear.QUANTITIES, CKF[row], strict=True):
-        found = nonlinear[f"{row}/{quantity}"]
+        found = nonlinear[f"{row}/{quantity.armse}"]
         assert abs(found.value - wanted) < 3.5 * sd
         assert found.standard_error == pytest.approx(sd, rel=0.8)
 
 
-def test_fusion_weight_of_sensor_1_falls_as_published():
-    """Fig. 11: .584 falling to .541; checked independently .5865 and .5455."""
-    tracking, choice = li2022_nonlinear.TRACKING, li2022_nonlinear.RULE_CHOICES[1]
-    _, sample = drawn(tracking, range(RUNS), 7)
-    weights = [f.weights[:, 0].mean() for f in gaussian_fusions(tracking, li2022_nonlinear.CKF, choice, sample)]
-    assert weights[0] == pytest.approx(0.5865, abs=0.004)
-    assert weights[-1] == pytest.approx(0.5455, abs=0.004)
+def test_fusion_weight_of_sensor_1_falls_as_published(nonlinear):
+    """Fig. 11: .584 falling to .541; ERRATA: .5865 and .5455."""
+    row = "ckf-arithmetic_average"
+    assert nonlinear[f"{row}/sensor_1_weight_first_1"].value == pytest.approx(0.5865, abs=0.004)
+    assert nonlinear[f"{row}/sensor_1_weight_last_1"].value == pytest.approx(0.5455, abs=0.004)
+
+
+def test_covariance_union_of_table_2_is_a_valid_bound_and_worse_than_the_average(nonlinear):
+    union, average = (nonlinear[f"ckf-{r}/position_armse_m"].value for r in ("covariance_union", "arithmetic_average"))
+    assert average < union < 0.9 * li2022_nonlinear.TABLE_2["ckf-covariance_union"][0]
+    credibility = {row: nonlinear[f"{row}/position_credibility_1"].value for row in CKF}
+    assert credibility["ckf-naive"] < 0.01 < 0.9 < credibility["ckf-alone"] < 1.15
+    assert credibility["ckf-arithmetic_average"] < nonlinear["ckf-covariance_union/position_credibility_1"].value
 
 
 def test_particle_rows_of_table_1():
     names = ("sir-alone", "sir-ic", "sir-arithmetic_average", "sir-arithmetic_average@gaussian")
-    table = li2022_linear.particle_rows()
-    found = study(li2022_linear, {n: table[n] for n in names}, 50, 1)
+    found = study(li2022_linear, names, 50, 1)
     value = {n: found[f"{n}/position_armse_m"] for n in names}
     assert abs(value["sir-arithmetic_average"].value - 19.48) < 3.5 * value["sir-arithmetic_average"].standard_error
     gaussian = value["sir-arithmetic_average@gaussian"]
@@ -60,20 +63,21 @@ def test_particle_rows_of_table_1():
 
 
 @pytest.mark.parametrize("module", [li2022_linear, li2022_nonlinear])
-def test_particle_rows_do_not_depend_on_the_batch(module):
+def test_rows_do_not_depend_on_the_batch(module):
     short = dataclasses.replace(module.TRACKING, steps=5)
     _, sample = drawn(short, range(3), 0)
-    rows = module.rows() if module is li2022_nonlinear else module.particle_rows()
-    for name, row in rows.items():
-        together = [mean for _, mean in zip(range(5), row.estimates(sample), strict=False)]
+    for name, row in module.STUDY.rows.items():
+        together = [fused for _, fused in zip(range(5), row.estimates(sample), strict=False)]
         alone = row.estimates(Sample(0, range(1, 2), [z[1:2] for z in sample.seen]))
         for whole, one in zip(together, alone, strict=False):
-            np.testing.assert_allclose(one[0], whole[1], rtol=1e-9, err_msg=name)
+            np.testing.assert_allclose(one.mean[0], whole.mean[1], rtol=1e-9, err_msg=name)
+            np.testing.assert_allclose(one.cov[-1], whole.cov[-1 if len(whole.cov) == 1 else 1], rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("module", [li2022_linear, li2022_nonlinear])
 def test_rows_are_chosen_by_the_beginning_of_their_names(module):
     found = module.SCENARIO.study(2, 0, only="sir-ic")
-    assert list(found) == [f"sir-ic/{quantity}" for quantity in module.QUANTITIES]
+    wanted = [quantity.armse for quantity in module.QUANTITIES]
+    assert list(found) == [f"sir-ic/{q}" for q in (*wanted, "position_claimed_m", "position_credibility_1")]
     with pytest.raises(ValueError, match="Unknown row 'sir-ci'. Did you mean 'sir-ic'"):
         module.SCENARIO.study(2, 0, only="sir-ci")

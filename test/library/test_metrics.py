@@ -27,6 +27,16 @@ def test_standard_error_is_the_jackknife(runs):
     assert armse(squared).standard_error == pytest.approx(wanted, rel=1e-10)
 
 
+def test_a_ratio_of_averages_has_the_spread_of_repeated_studies():
+    rng = np.random.default_rng(2)
+    below = rng.chisquare(4, (2000, 40))
+    studies = [Estimate.ratio(0.5 * b + rng.chisquare(2, 40), b) for b in below]
+    assert np.mean([s.value for s in studies]) == pytest.approx(1.0, abs=0.02)
+    spread = np.std([s.value for s in studies])
+    assert np.mean([s.standard_error for s in studies]) == pytest.approx(spread, rel=0.06)
+    assert Estimate.ratio(np.array([3.0]), np.array([2.0])).value == 1.5
+
+
 def test_standard_error_is_the_spread_of_repeated_studies():
     """With errors as correlated over the steps as those of a filter."""
     rng = np.random.default_rng(0)

@@ -177,7 +177,7 @@ def library(rule: str | None) -> NDArray[np.float64]:
     else:
         choice = next(c for c in get_scenario(SCENARIO).rules if c.name == rule)
         estimates = li2022_linear.fused_filters(choice, seen)
-    return np.array([mean[0] for mean in estimates])
+    return np.array([fused.mean[0] for fused in estimates])
 
 
 def compare_with_library(messages: list[PointCloud2], rule: str | None) -> None:
@@ -191,7 +191,7 @@ def test_covariance_intersection_agrees_with_the_library(repeats: list[list[Poin
     compare_with_library(repeats[0], "covariance_intersection")
 
 
-@pytest.mark.parametrize("rule", ["naive", "arithmetic_average", None])
+@pytest.mark.parametrize("rule", ["naive", "arithmetic_average", "covariance_union", None])
 def test_the_nodes_agree_with_the_library(rule: str | None, ros_context: Any, ros_domain: int, tmp_path: Path) -> None:
     log, judged = tmp_path / "nodes.log", tmp_path / "judged.json"
     with Probe(ros_context) as probe:

@@ -57,6 +57,11 @@ class Estimate:
         variance = (runs - 1) / runs * ((left_out - left_out.mean()) ** 2).sum()
         return cls(value, float(np.sqrt(variance)), runs)
 
+    @classmethod
+    def ratio(cls, numerator: Array, denominator: Array) -> Estimate:
+        """Ratio of two averages over the same runs, (R,) each."""
+        return cls.of_averages(np.stack([numerator, denominator], -1), lambda mean: mean[:, 0] / mean[:, 1])
+
     def spread(self, runs: int) -> float:
         """Standard deviation that the figure would have in a study of so many runs."""
         return float(self.standard_error * np.sqrt(self.runs / runs))

@@ -16,7 +16,7 @@ from track_fusion.models.base import Motion, Sensor
 from track_fusion.models.noise import Noise
 from track_fusion.params import ParameterError, Params, unknown_name_error
 from track_fusion.report.chart import Chart
-from track_fusion.rules import RULES, Rule, SourceTracks
+from track_fusion.rules import RULES, FusedTracks, Rule, SourceTracks
 from track_fusion.tracks import StateLayout
 
 T = TypeVar("T")
@@ -224,17 +224,20 @@ class Scenario:
         return self.figures(self.sample(range(runs), seed, progress, only))
 
 
-def fuse_runs(rule: Rule, params: Params, mean: Array, cov: Array) -> tuple[Array, Array]:
+def fuse_runs(
+    rule: Rule, params: Params, mean: Array, cov: Array, rngs: Sequence[np.random.Generator] | None = None
+) -> FusedTracks:
     """Fuse the tracks of R runs, covariances that all runs share only once.
 
     Parameters
     ----------
     mean : (R, K, n)
     cov : (R, K, n, n), or (1, K, n, n) where all runs have the same
+    rngs : one generator a run, or None    for a rule that samples: each run then draws its own numbers
 
     Returns
     -------
-    mean (R, n), cov (R, n, n) or (1, n, n)
+    FusedTracks    mean (R, n), cov (R, n, n) or (1, n, n), weights (R, K), (1, K) or None
 
     Notes    A linear rule gives sum of A_i x_i; fusing unit vectors gives its matrices A_i.
     """
@@ -242,9 +245,20 @@ def fuse_runs(rule: Rule, params: Params, mean: Array, cov: Array) -> tuple[Arra
     if len(cov) < runs and rule.linear:
         units = np.eye(count * n).reshape(-1, count, n)
         fused = rule.fuse(SourceTracks(units, np.repeat(cov, len(units), 0)), params)
-        return matvec(transpose(fused.mean), mean.reshape(runs, -1)), fused.cov[:1]
-    fused = rule.fuse(SourceTracks(mean, np.broadcast_to(cov, (runs, count, n, n))), params)
-    return fused.mean, fused.cov
+        weights = None if fused.weights is None else fused.weights[:1]
+        return FusedTracks(matvec(transpose(fused.mean), mean.reshape(runs, -1)), fused.cov[:1], weights)
+    tracks = SourceTracks(mean, np.broadcast_to(cov, (runs, count, n, n)))
+    if rngs is None or "seed" not in rule.optional:
+        return rule.fuse(tracks, params)
+    each = [rule.fuse(_one_run(tracks, r, rng), params) for r, rng in enumerate(rngs)]
+    weighed = [f.weights for f in each if f.weights is not None]
+    weights = np.concatenate(weighed) if weighed else None
+    return FusedTracks(np.concatenate([f.mean for f in each]), np.concatenate([f.cov for f in each]), weights)
+
+
+def _one_run(tracks: SourceTracks, run: int, rng: np.random.Generator) -> SourceTracks:
+    at = slice(run, run + 1)
+    return SourceTracks(tracks.mean[at], tracks.cov[at], extras={"seed": rng})
 
 
 def check_needs(choices: Sequence[RuleChoice], given: Collection[str] = ()) -> None:

@@ -1,13 +1,13 @@
 """One target seen by sensors with a filter each, whose posteriors are fused and fed back: what Li 2022 studies.
 
-Every row of a table is an iterator of estimates over the steps, batched over Monte Carlo runs; errors are
-collected by :func:`squared_errors`.
+Every row of a table is an iterator of posteriors over the steps, batched over Monte Carlo runs; what a study keeps of
+them is collected by one_target_study.py.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,18 +16,32 @@ from track_fusion.filters import iterated_corrector, particle
 from track_fusion.filters.iterated_corrector import GaussianUpdate
 from track_fusion.filters.particle import Particles
 from track_fusion.linalg import Array
-from track_fusion.metrics.accuracy import rmse
 from track_fusion.models.base import Transition
 from track_fusion.random_streams import stream
-from track_fusion.report.chart import Chart, Series
 from track_fusion.rules import RULES, FusedTracks, SourceTracks
-from track_fusion.scenarios.base import Progress, RuleChoice, Samples, Tracking
+from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
+from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
+from track_fusion.rules.covariance_union import CovarianceUnionParams
+from track_fusion.rules.naive import NaiveParams
+from track_fusion.scenarios.base import RuleChoice, Tracking, fuse_runs
 
 #: Particles of so many runs are worked on at once: larger arrays leave the cache.
 SIR_CHUNK = 50
 #: What is added to the covariance of particles turned into a Gaussian, as a share of the initial variances: particles
 #: that have collapsed onto a few points have a singular one.
 COVARIANCE_FLOOR = 1e-9
+
+#: The rules of section IV. Covariance union is a bound of all P_i + (x - x_i)(x - x_i)' about the arithmetic average,
+#: about the mean at which that bound is least, or, as eq. (8) is printed, the one of them with the largest trace.
+RULE_CHOICES = (
+    RuleChoice("naive", NaiveParams()),
+    RuleChoice("arithmetic_average", ArithmeticAverageParams(criterion="diversity")),
+    RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="trace")),
+    RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="uniform"), "uniform"),
+    RuleChoice("covariance_union", CovarianceUnionParams(criterion="trace", mean="diversity")),
+    RuleChoice("covariance_union", CovarianceUnionParams(criterion="trace", mean="optimal"), "optimal_mean"),
+    RuleChoice("covariance_union", CovarianceUnionParams(bound="max_trace", mean="diversity"), "max_trace"),
+)
 
 
 class GaussianFilter(NamedTuple):
@@ -46,17 +60,14 @@ class Sample(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A row of a table: estimated means (R, n) step by step of so many runs at a time (0: of all)."""
+    """A row of a table: posteriors step by step, of so many runs at a time (0: of all).
 
-    estimates: Callable[[Sample], Iterator[Array]]
+    They are mean (R, n), cov (R, n, n) or, where all runs share it, (1, n, n), and of fused tracks the fusion weights
+    (R, K) or (1, K).
+    """
+
+    estimates: Callable[[Sample], Iterator[FusedTracks]]
     chunk: int = 0
-
-
-class Quantity(NamedTuple):
-    """The norm of some axes of the error, in a unit of its own."""
-
-    axes: tuple[int, ...]
-    factor: float = 1.0
 
 
 def start(tracking: Tracking, runs: int) -> tuple[Array, Array]:
@@ -67,36 +78,38 @@ def start(tracking: Tracking, runs: int) -> tuple[Array, Array]:
 def gaussian_alone(tracking: Tracking, one: GaussianFilter, sensors: int) -> Row:
     """One filter that uses the first so many sensors, one after the other (IC)."""
 
-    def estimates(sample: Sample) -> Iterator[Array]:
+    def estimates(sample: Sample) -> Iterator[FusedTracks]:
         used = list(tracking.sensors.values())[:sensors]
         mean, cov = start(tracking, len(sample.runs))
         for k in range(tracking.steps):
             mean, cov = one.predict(mean, cov, tracking.motion.over(tracking.dt_s))
             zs = [z[:, k] for z in sample.seen[:sensors]]
             mean, cov, _ = iterated_corrector.update(mean, cov, zs, used, one.update)
-            yield mean
+            yield FusedTracks(mean, cov)
 
     return Row(estimates)
 
 
 def gaussian_fused(tracking: Tracking, one: GaussianFilter, choice: RuleChoice) -> Row:
     """One filter a sensor, fused after each step, the fused posterior fed back to all of them."""
-    return Row(lambda sample: (fused.mean for fused in gaussian_fusions(tracking, one, choice, sample)))
+
+    def estimates(sample: Sample) -> Iterator[FusedTracks]:
+        rngs, (mean, cov) = fusion_streams(sample), start(tracking, len(sample.runs))
+        for k in range(tracking.steps):
+            mean, cov = one.predict(mean, cov, tracking.motion.over(tracking.dt_s))
+            pairs = zip(sample.seen, tracking.sensors.values(), strict=True)
+            local = [one.update(mean, cov, z[:, k], sensor)[:2] for z, sensor in pairs]
+            means, covs = (np.stack(parts, 1) for parts in zip(*local, strict=True))
+            fused = fuse_runs(RULES[choice.key], choice.params, means, covs, rngs)
+            mean, cov = fused.mean, fused.cov
+            yield fused
+
+    return Row(estimates)
 
 
-def gaussian_fusions(
-    tracking: Tracking, one: GaussianFilter, choice: RuleChoice, sample: Sample
-) -> Iterator[FusedTracks]:
-    """Yield what the rule gives at each step of :func:`gaussian_fused`, weights included."""
-    mean, cov = start(tracking, len(sample.runs))
-    for k in range(tracking.steps):
-        mean, cov = one.predict(mean, cov, tracking.motion.over(tracking.dt_s))
-        pairs = zip(sample.seen, tracking.sensors.values(), strict=True)
-        local = [one.update(mean, cov, z[:, k], sensor)[:2] for z, sensor in pairs]
-        tracks = SourceTracks(np.stack([m for m, _ in local], 1), np.stack([c for _, c in local], 1))
-        fused = RULES[choice.key].fuse(tracks, choice.params)
-        mean, cov = fused.mean, fused.cov
-        yield fused
+def fusion_streams(sample: Sample) -> list[np.random.Generator]:
+    """Return what a rule that samples draws from, a generator a run."""
+    return [stream(sample.seed, run, "fusion_centre") for run in sample.runs]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,14 +127,14 @@ def _streams(sample: Sample, name: str) -> list[np.random.Generator]:
 def sir_alone(tracking: Tracking, sir: Sir, sensors: int) -> Row:
     """One particle filter weighted by the first so many sensors (IC), resampled after every step."""
 
-    def estimates(sample: Sample) -> Iterator[Array]:
+    def estimates(sample: Sample) -> Iterator[FusedTracks]:
         used, rng = list(tracking.sensors.values())[:sensors], _streams(sample, next(iter(tracking.sensors)))
         cloud = particle.from_gaussian(*start(tracking, len(sample.runs)), rng, sir.count)
         for k in range(tracking.steps):
             cloud = particle.predict(cloud, tracking.motion.over(tracking.dt_s), rng)
             for z, sensor in zip(sample.seen, used, strict=False):
                 cloud, _ = particle.update(cloud, z[:, k], sensor)
-            yield particle.moments(cloud)[0]
+            yield FusedTracks(*particle.moments(cloud))
             cloud = particle.RESAMPLING[sir.resampling](cloud, rng, sir.count)
 
     return Row(estimates, SIR_CHUNK)
@@ -134,7 +147,7 @@ def sir_fused(tracking: Tracking, sir: Sir, choice: RuleChoice, union: bool = Fa
     themselves: the arithmetic average of their densities.
     """
 
-    def estimates(sample: Sample) -> Iterator[Array]:
+    def estimates(sample: Sample) -> Iterator[FusedTracks]:
         streams = [_streams(sample, name) for name in tracking.sensors]
         clouds = [particle.from_gaussian(*start(tracking, len(sample.runs)), rng, sir.count) for rng in streams]
         for k in range(tracking.steps):
@@ -145,10 +158,21 @@ def sir_fused(tracking: Tracking, sir: Sir, choice: RuleChoice, union: bool = Fa
             triples = zip(moved, sample.seen, tracking.sensors.values(), strict=True)
             clouds = [particle.update(cloud, z[:, k], sensor)[0] for cloud, z, sensor in triples]
             fused = RULES[choice.key].fuse(_converted(tracking, clouds), choice.params)
-            yield fused.mean
+            yield fused
             clouds = [_drawn_again(clouds, fused, rng, sir, union) for rng in streams]
 
     return Row(estimates, SIR_CHUNK)
+
+
+def sir_rows(tracking: Tracking, sir: Sir, choices: Sequence[RuleChoice]) -> dict[str, Row]:
+    """Every row by particle filters; the arithmetic average joins the particles, or (@gaussian) their Gaussians."""
+    table = {"sir-alone": sir_alone(tracking, sir, 1), "sir-ic": sir_alone(tracking, sir, 2)}
+    for choice in choices:
+        averaged = choice.key == "arithmetic_average"
+        table[f"sir-{choice.name}"] = sir_fused(tracking, sir, choice, union=averaged)
+        if averaged:
+            table[f"sir-{choice.name}@gaussian"] = sir_fused(tracking, sir, choice)
+    return table
 
 
 def _converted(tracking: Tracking, clouds: Sequence[Particles]) -> SourceTracks:
@@ -171,52 +195,3 @@ def drawn(tracking: Tracking, runs: Sequence[int], seed: int) -> tuple[Array, Sa
     truth = tracking.truths(seed, runs)
     seen = [tracking.measurements(states, seed, run) for states, run in zip(truth, runs, strict=True)]
     return truth, Sample(seed, runs, [np.stack([s[name] for s in seen]) for name in tracking.sensors])
-
-
-def squared_errors(
-    tracking: Tracking,
-    rows: Mapping[str, Row],
-    quantities: Mapping[str, Quantity],
-    runs: Sequence[int],
-    seed: int,
-    progress: Progress,
-) -> dict[str, Array]:
-    """Run every row over the same Monte Carlo runs.
-
-    Returns
-    -------
-    {row/quantity: squared norm of the error (R, T)}
-    """
-    truth, sample = drawn(tracking, runs, seed)
-    found: dict[str, Array] = {}
-    for done, (name, row) in enumerate(rows.items()):
-        names, step = [f"{name}/{q}" for q in quantities], row.chunk or len(runs)
-        found |= {full: np.empty((len(runs), tracking.steps)) for full in names}
-        for begin in range(0, len(runs), step):
-            part = slice(begin, min(begin + step, len(runs)))
-            for k, mean in enumerate(row.estimates(Sample(seed, runs[part], [z[part] for z in sample.seen]))):
-                error = mean - truth[part, k + 1]
-                for full, quantity in zip(names, quantities.values(), strict=True):
-                    found[full][part, k] = ((error[:, quantity.axes] * quantity.factor) ** 2).sum(1)
-                share = (begin + (part.stop - begin) * (k + 1) / tracking.steps) / len(runs)
-                progress((done + share) / len(rows))
-    return found
-
-
-def charts(samples: Samples) -> list[Chart]:
-    """Root-mean-square error over the steps, one chart a filter and quantity."""
-    groups: dict[tuple[str, str], list[Series]] = {}
-    for name, squares in samples.items():
-        row, _, quantity = name.rpartition("/")
-        one, _, rule = row.partition("-")
-        steps = np.arange(1, squares.shape[1] + 1)
-        groups.setdefault((one, quantity), []).append(Series(rule, steps, rmse(squares)))
-    return [
-        Chart(
-            f"{one.upper()}: {quantity.replace('_armse_', ' RMSE, ')}",
-            "step",
-            quantity.rpartition("_")[2],
-            tuple(lines),
-        )
-        for (one, quantity), lines in groups.items()
-    ]

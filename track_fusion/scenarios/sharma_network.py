@@ -72,7 +72,8 @@ class Network:
             size = max(len(own.cov), len(heard.cov))
             covs = [np.broadcast_to(t.cov, (size, *t.cov.shape[1:])) for t in (own, heard)]
             means = np.stack([own.mean, heard.mean], 1)
-            return Tracks(*fuse_runs(RULES[choice.key], choice.params, means, np.stack(covs, 1)))
+            fused = fuse_runs(RULES[choice.key], choice.params, means, np.stack(covs, 1))
+            return Tracks(fused.mean, fused.cov)
 
         peers = {name: Peer(tracks) for name, tracks in local.nodes.items()}
         for sent in self.rounds:
