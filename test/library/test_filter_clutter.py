@@ -200,3 +200,20 @@ def test_bearings_may_be_counted_from_zero_to_two_pi():
     assert [len(b) for b in batches] == [1, 1]
     np.testing.assert_allclose(batches[1].mean, batches[0].mean, rtol=1e-9)
     assert np.linalg.norm(batches[0].mean[0, 0, :2] - states[-1, :2]) < 600.0
+
+
+@pytest.mark.parametrize("reach_m", [300.0, 30e3])
+def test_the_search_misses_no_detection_in_a_gate(reach_m):
+    """Of tracks all round the radar, some so near that their gates hold all bearings."""
+    rng, one = np.random.default_rng(6), tracker()
+    mean = np.concatenate([RADAR.location + rng.uniform(-reach_m, reach_m, (40, 2)), np.zeros((40, 2))], 1)
+    a = rng.normal(size=(40, 4, 4)) * np.array([300.0, 300.0, 30.0, 30.0])[:, None]
+    cov = a @ np.swapaxes(a, 1, 2)
+    values = rng.uniform([0.0, -np.pi], [1.5 * reach_m, np.pi], (300, 2))
+    present = np.ones((40, 300), bool)
+    gated = pda.update(mean, cov, np.tile(values, (40, 1, 1)), present, RADAR, one.params)[2].gated
+    found = np.zeros_like(gated)
+    found[one._near(mean, cov, values)] = True
+    assert gated.any()
+    assert not (gated & ~found).any()
+    assert found.sum() < 2 * gated.sum() + 50

@@ -23,7 +23,16 @@ from track_fusion.scenarios import (
     sharma_radars,
     sharma_scalar,
 )
-from track_fusion.scenarios.base import Claim, RuleChoice, Samples, Scenario, Tracking, judged_claims, judged_figures
+from track_fusion.scenarios.base import (
+    Claim,
+    RuleChoice,
+    Samples,
+    Scenario,
+    Scene,
+    Tracking,
+    judged_claims,
+    judged_figures,
+)
 
 _MODULES = (
     li2022_linear,
@@ -67,6 +76,7 @@ __all__ = [
     "RuleChoice",
     "Samples",
     "Scenario",
+    "Scene",
     "Tracking",
     "get_scenario",
     "judged_claims",
