@@ -83,3 +83,9 @@ def test_verdict(scale, verdict):
 def test_no_sample_proves_nothing():
     found = consistency(np.zeros(0), 4)
     assert (found.verdict, found.samples) == ("unknown", 0)
+
+
+def test_what_is_the_same_in_all_runs_has_no_error_at_all():
+    found = Estimate.mean(np.full(1000, 0.1))
+    assert (found.value, found.standard_error) == (0.1, 0.0)
+    assert np.isnan(Estimate.mean(np.array([0.1])).standard_error)  # one run proves nothing

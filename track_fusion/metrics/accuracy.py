@@ -25,8 +25,10 @@ class Estimate:
 
     @classmethod
     def mean(cls, values: Array) -> Estimate:
-        """Average over runs, (R,)."""
+        """Average over runs, (R,); where all runs have the same value, that value without rounding."""
         values = np.asarray(values, float)
+        if len(values) > 1 and (values == values[0]).all():
+            return cls(float(values[0]), 0.0, len(values))
         error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else float("nan")
         return cls(float(values.mean()), float(error), len(values))
 

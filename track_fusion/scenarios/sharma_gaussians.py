@@ -135,7 +135,12 @@ def _bars(measured: dict[str, Estimate]) -> Chart:
 
 def _ellipses(samples: Samples, rows: dict[str, str]) -> list[Series]:
     return [
-        ellipse(label, samples[f"{row}/mean"][0], samples[f"{row}/cov"][0])
+        ellipse(
+            label,
+            samples[f"{row}/mean"][0],
+            samples[f"{row}/cov"][0],
+            style="dotted" if label in ("GMD-S", "HMD-S") else "line",
+        )
         for label, row in rows.items()
         if f"{row}/mean" in samples
     ]

@@ -83,11 +83,11 @@ class Network:
 
 #: Rows of each reading: one filter that saw all, and the rules.
 ROWS: dict[str, RuleChoice | None] = {"centralised": None} | {choice.name: choice for choice in RULE_CHOICES}
-#: Rows of one picture of covariances, which would not all be told apart in one.
-PICTURES = {
-    "centralised, naive and HMD-GA": ("centralised", "naive", "harmonic_mean"),
-    "CI, ICI and EI": ("covariance_intersection", "inverse_covariance_intersection", "ellipsoidal_intersection"),
-}
+#: What the paper calls the rows; those of one picture together, which would not all be told apart in one.
+PICTURES = (
+    {"centralised": "centralised", "naive": "naive", "harmonic_mean": "HMD-GA"},
+    {"covariance_intersection": "CI", "inverse_covariance_intersection": "ICI", "ellipsoidal_intersection": "EI"},
+)
 
 
 def row_name(row: str, reading: str = "") -> str:
@@ -140,12 +140,12 @@ def charts(readings: Mapping[str, str], samples: Samples) -> list[Chart]:
     """
     found = []
     for reading, title in readings.items():
-        for group, rows in PICTURES.items():
-            lines = [line for row in rows for line in _ellipses(samples, row, reading)]
+        for labels in PICTURES:
+            lines = [line for row in labels for line in _ellipses(samples, row, reading, labels[row])]
             if lines:
-                found.append(Chart(f"2-sigma covariances, {title}: {group}", "x", "y", tuple(lines), equal=True))
+                found.append(Chart(f"{title}, 2 sigma", "x", "y", tuple(lines), equal=True))
     measured = figures(samples)
-    bars = {name.removeprefix("kf-"): measured[f"{name}/nees_1"] for name in _rows(samples)}
+    bars = {_label(name): measured[f"{name}/nees_1"] for name in _rows(samples)}
     place = np.arange(len(bars), dtype=float)
     errors = np.nan_to_num([e.standard_error for e in bars.values()])
     series = (
@@ -156,7 +156,13 @@ def charts(readings: Mapping[str, str], samples: Samples) -> list[Chart]:
     return [*found, Chart("Squared errors over the covariance reported", "", "NEES / n", series, ticks=ticks)]
 
 
-def _ellipses(samples: Samples, row: str, reading: str) -> list[Series]:
+def _label(name: str) -> str:
+    """Shorten the name of a row: CI@one_row."""
+    row, at, reading = name.removeprefix("kf-").partition("@")
+    return {**PICTURES[0], **PICTURES[1]}[row] + at + reading
+
+
+def _ellipses(samples: Samples, row: str, reading: str, label: str) -> list[Series]:
     """Ellipses of the covariance that a row reports on average, and of its errors."""
     name = row_name(row, reading)
     if f"{name}/error" not in samples:
@@ -164,8 +170,8 @@ def _ellipses(samples: Samples, row: str, reading: str) -> list[Series]:
     error = samples[f"{name}/error"]
     floor = 1e-12 * np.eye(error.shape[1])  # a single run's errors have a singular one
     spread, origin = outer(error).mean(0) + floor, np.zeros(error.shape[1])
-    reported = ellipse(f"{row}, reported", origin, samples[f"{name}/cov"].mean(0))
-    return [reported, ellipse(f"{row}, errors", origin, spread, style="dashed")]
+    reported = ellipse(f"{label}, reported", origin, samples[f"{name}/cov"].mean(0))
+    return [reported, ellipse(f"{label}, errors", origin, spread, style="dashed")]
 
 
 def compare(

@@ -64,7 +64,7 @@ def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -
 
 def charts(samples: Samples) -> list[Chart]:
     """Fig. 6 for both readings of the measurements."""
-    return shared.charts({"": "at S10, (82) as printed", "one_row": "at S10, one component each"}, samples)
+    return shared.charts({"": "S10, (82) as printed", "one_row": "S10, one component each"}, samples)
 
 
 def _bloated(text: str, reading: str) -> Claim:

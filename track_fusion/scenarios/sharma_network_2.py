@@ -54,7 +54,7 @@ def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -
 
 def charts(samples: Samples) -> list[Chart]:
     """Fig. 7."""
-    return shared.charts({"": "at S5"}, samples)
+    return shared.charts({"": "S5"}, samples)
 
 
 def _almost(central: Estimate, harmonic: Estimate) -> bool:
