@@ -21,6 +21,11 @@ def symmetrise(a: Array) -> Array:
     return 0.5 * (a + transpose(a))
 
 
+def asymmetric(a: Array) -> bool:
+    """Tell whether any matrix, (..., n, n), differs from its transpose by more than rounding."""
+    return bool((np.abs(a - transpose(a)) > ASYMMETRY_TOLERANCE * np.abs(a).max((-2, -1), keepdims=True)).any())
+
+
 def outer(a: Array) -> Array:
     """Return a a' of each vector: (..., n) -> (..., n, n)."""
     return a[..., :, None] * a[..., None, :]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from track_fusion.densities.log_domain import effective_sample_size, log_mean_exp, log_sum_exp, normalised
 from track_fusion.densities.mixture import Factored, Mixture, chosen, sample
 from track_fusion.densities.mixture_algebra import LogMixture, power, product
-from track_fusion.linalg import Array, cholesky, eliminate, outer, symmetrise, transpose, whitener
+from track_fusion.linalg import Array, cholesky, eliminate, is_positive_definite, outer, symmetrise, transpose, whitener
 from track_fusion.optimise import minimise_on_interval
 
 
@@ -137,6 +137,8 @@ class Learned(NamedTuple):
 GROWTH = 1e-5
 #: Covariances learned by Algorithm 2 keep this share of the samples' own.
 EM_FLOOR = 1e-3
+#: A covariance of samples is singular if it is not positive definite without this share of its variances.
+SINGULAR = 1e-13
 
 
 def weighted_em(
@@ -153,11 +155,22 @@ def weighted_em(
     count, rng, steps        components, generator, most iterations
     floor : float            smallest covariance, as a share of the samples' own
 
+    Raises
+    ------
+    ValueError    so few samples have weight that they have no covariance
+
     References    N. R. Ahmed, Algorithm 2, with the weights normalised.
     """
     points, theta = samples.points, normalised(samples.log_weight)
     n = points.shape[-1]
     mean, cov = samples.moments()
+    # Rounding makes some singular covariances positive definite.
+    if not is_positive_definite(cov - SINGULAR * np.diagonal(cov, axis1=-2, axis2=-1)[..., None] * np.eye(n)).all():
+        raise ValueError(
+            f"No mixture can be learned from the samples: no more than {samples.ess.min():.3g} of {points.shape[-2]} "
+            "are effective, and their covariance is singular. What they are drawn from is far from what they are to "
+            "stand for."
+        )
     start = np.cumsum(theta, -1)
     at = (np.arange(count) + rng.random(count)) / count
     picked = np.minimum((start[..., None, :] < at[:, None]).sum(-1), points.shape[-2] - 1)

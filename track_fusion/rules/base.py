@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from track_fusion.densities.mixture import Mixture as Mixture
-from track_fusion.linalg import ASYMMETRY_TOLERANCE, Array, is_positive_definite, symmetrise, transpose
+from track_fusion.linalg import Array, asymmetric, is_positive_definite, symmetrise
 from track_fusion.params import Params
 
 Family = Literal["gaussian", "elliptical", "mixture"]
@@ -135,7 +135,7 @@ def check_tracks(tracks: SourceTracks) -> None:
     _check_shape("cov", cov, (*mean.shape, mean.shape[-1]))
     _check_finite("mean", mean)
     _check_finite("cov", cov)
-    if (np.abs(cov - transpose(cov)) > ASYMMETRY_TOLERANCE * np.abs(cov).max((-2, -1), keepdims=True)).any():
+    if asymmetric(cov):
         raise ValueError("The 'cov' of source tracks must be symmetric.")
     good = is_positive_definite(cov)
     if not good.all():
@@ -160,6 +160,8 @@ def _check_mixture(mixture: Mixture, shape: tuple[int, ...]) -> None:
     _check_shape("mixture.cov", mixture.cov, (*batch, *part, n, n))
     for name in ("weight", "mean", "cov"):
         _check_finite(f"mixture.{name}", getattr(mixture, name))
+    if asymmetric(mixture.cov):
+        raise ValueError("The 'mixture.cov' of source tracks must be symmetric.")
     if (mixture.weight < 0).any():
         raise ValueError(f"The 'mixture.weight' of source tracks must be non-negative. Got {mixture.weight.min()}.")
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.mixture import Mixture, moments, padded, same
+from track_fusion.densities.mixture import Mixture, chosen, moments, padded, same
 from track_fusion.densities.mixture_algebra import LogMixture, power, product
 from track_fusion.densities.mixture_reduction import REDUCTIONS, prune
 from track_fusion.linalg import Array, is_positive_definite
@@ -157,6 +157,23 @@ class Step(NamedTuple):
     mixture: Mixture
     omega: Array | None
     info: Mapping[str, NDArray[Any]]
+
+
+def either(take: NDArray[np.bool_], one: Step, other: Step) -> Step:
+    """Take, where `take` (...), the step `one`, else `other`; both have a weight of the first, or neither has."""
+    omega = None if one.omega is None or other.omega is None else np.where(take, one.omega, other.omega)
+    info = {name: np.where(take, one.info[name], other.info[name]) for name in other.info}
+    return Step(chosen(take, one.mixture, other.mixture), omega, info)
+
+
+def has_one_component(mixture: Mixture) -> NDArray[np.bool_]:
+    """Tell which mixtures (...) are Gaussian: the other components, if any, have no weight."""
+    return np.asarray((mixture.weight > 0.0).sum(-1) == 1)
+
+
+def heaviest(mixture: Mixture) -> Mixture:
+    """Return the heaviest component (..., 1) of each mixture (..., C)."""
+    return mixture.take(mixture.weight.argmax(-1)[..., None])
 
 
 #: How a diagnostic of several steps becomes that of the whole; what is not named here must hold at every step.

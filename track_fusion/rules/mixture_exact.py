@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.log_domain import normalised
+from track_fusion.densities.log_domain import log_sum_exp, normalised
 from track_fusion.densities.mixture import Factored, Mixture, chosen, moments, same, sample
+from track_fusion.densities.mixture_algebra import LogMixture, product
 from track_fusion.densities.mixture_proposals import (
     MOST_SPREAD,
     indirect_global_sampling,
@@ -28,10 +29,18 @@ from track_fusion.densities.mixture_quotient import (
     not_integrable,
 )
 from track_fusion.densities.mixture_sampling import Weighted, weighted_em
-from track_fusion.linalg import Array, is_positive_definite
+from track_fusion.linalg import Array, asymmetric, is_positive_definite
 from track_fusion.params import param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.mixture_common import Generators, Step, fold_mixtures, fuse_sampled
+from track_fusion.rules.mixture_common import (
+    Generators,
+    Step,
+    either,
+    fold_mixtures,
+    fuse_sampled,
+    has_one_component,
+    heaviest,
+)
 from track_fusion.rules.mixture_quotients import QuotientParams, sample_mixands
 
 
@@ -73,10 +82,11 @@ def fuse(tracks: SourceTracks, params: MixtureExactParams) -> FusedTracks:
 
     Raises
     ------
-    ValueError     'common' does not fit, a component has no covariance, or a quotient has no integral
+    ValueError     'common' does not fit, a component has no covariance, a quotient has no integral, or (method
+                   common_proposal) so few samples have weight that nothing can be learned from them
 
-    Notes          One component each: the quotient in closed form, without sampling. A source that equals the common
-                   information adds nothing, exactly. Else sampled: moments vary with the seed by
+    Notes          One component of any weight each: the quotient in closed form, without sampling. A source that
+                   equals the common information adds nothing, exactly. Else sampled: moments vary with the seed by
                    about a standard deviation over the root of the number of effective samples. No guarantee if the
                    sources share more than is given: two copies of N(x, P) with common information N(x, 2 P)
                    claim P / 1.5 with an error of P. O(C^2 S T n^2) for S samples a mixand.
@@ -126,26 +136,43 @@ def _checked(common: Mixture, lead: tuple[int, ...], n: int) -> Mixture:
         raise ValueError("The extra 'common' must be finite.")
     if not is_positive_definite(common.cov).all():
         raise ValueError("The extra 'common' must have positive definite covariances.")
+    if asymmetric(common.cov):
+        raise ValueError("The extra 'common' must have symmetric covariances.")
     return common.normalised.broadcast(lead)
 
 
 def _fuse_pair(
     first: Mixture, second: Mixture, common: Mixture, params: MixtureExactParams, rng: np.random.Generator
 ) -> Step:
+    if params.method == "naive_bayes":
+        whole = product(LogMixture.of(first), LogMixture.of(second))
+        return Step(whole.normalised, None, _info(first) | {"log_eta": log_sum_exp(whole.log_weight)})
+    silent = same(first, common), same(second, common)
+    nothing_new = silent[0] | silent[1]
+    # A source that says no more than what both share gives the other, whatever the quotient.
+    answer = Step(chosen(silent[0], second, first), None, _info(first))
+    single = has_one_component(first) & has_one_component(second) & has_one_component(common)
+    fused = answer
+    if not single.all():
+        fused = _by(params.method, Problem.of(first, second, common, nothing_new), params, rng)
+    if single.any():
+        closed = Problem.of(heaviest(first), heaviest(second), heaviest(common), nothing_new | ~single)
+        fused = either(single, _by("mmgd", closed, params, rng), fused)
+    return either(nothing_new, answer, fused)
+
+
+def _info(first: Mixture) -> dict[str, NDArray[Any]]:
+    """Diagnostics (...) of a fusion without sampling."""
     lead = first.weight.shape[:-1]
-    quotient = exact_quotient(first, second, common)
-    info: dict[str, NDArray[Any]] = {
+    return {
         "converged": np.ones(lead, bool), "ess": np.ones(lead), "log_eta": np.zeros(lead), "pruned": np.zeros(lead),
         "skipped": np.zeros(lead, np.intp),
     }  # fmt: skip
-    if params.method == "naive_bayes":
-        return Step(quotient.numerator.normalised, None, info)
-    nothing_new = same(first, common) | same(second, common)
-    problem = Problem(quotient, first, second, common, nothing_new)
-    single = first.count == second.count == common.count == 1
-    fused, more = METHODS["mmgd" if single else params.method](problem, params, rng)
-    fused = chosen(same(second, common), first, fused)
-    return Step(chosen(same(first, common), second, fused), None, info | more)
+
+
+def _by(method: str, problem: Problem, params: MixtureExactParams, rng: np.random.Generator) -> Step:
+    fused, more = METHODS[method](problem, params, rng)
+    return Step(fused, None, _info(problem.first) | more)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,6 +184,11 @@ class Problem:
     second: Mixture
     common: Mixture
     exempt: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, first: Mixture, second: Mixture, common: Mixture, exempt: NDArray[np.bool_]) -> Problem:
+        """State the quotient."""
+        return cls(exact_quotient(first, second, common), first, second, common, exempt)
 
     def admitted(self, bad: NDArray[np.bool_], params: MixtureExactParams) -> tuple[Quotient, NDArray[np.intp]]:
         """Leave out mixands `bad` (..., M) that have no integral, or refuse; return the rest and how many went.
@@ -173,7 +205,7 @@ class Problem:
             pairs = np.isfinite(self.quotient.numerator.log_weight).sum()
             raise ValueError(
                 f"The quotient by the extra 'common' has no integral for {bad.sum()} of {pairs} pairs of "
-                "components: along some direction their product is no sharper than any component of 'common'. "
+                "components: along some direction their product falls no faster than 'common'. "
                 "The parameter 'not_integrable' = 'skip' leaves such pairs out, if others remain."
             )
         numerator = self.quotient.numerator._replace(log_weight=weight)
@@ -225,14 +257,16 @@ def _igs(problem: Problem, params: MixtureExactParams, rng: np.random.Generator)
 def _laplace(problem: Problem, params: MixtureExactParams, rng: np.random.Generator) -> Result:
     _, _, found, info = _prepared(problem, params)
     good = found.converged | ~np.isfinite(found.log_moment) | problem.exempt[..., None]
-    return Mixture(normalised(found.log_moment), found.mean, found.cov), info | {"converged": np.asarray(good.all(-1))}
+    info |= {"converged": np.asarray(good.all(-1)), "log_eta": log_sum_exp(found.log_moment)}
+    return Mixture(normalised(found.log_moment), found.mean, found.cov), info
 
 
 def _mmgd(problem: Problem, params: MixtureExactParams, rng: np.random.Generator) -> Result:
     divided, proper = moment_matched(problem.quotient, *moments(problem.common))
     quotient, skipped = problem.admitted(~proper & np.isfinite(divided.log_weight), params)
     weight = np.where(np.isfinite(quotient.numerator.log_weight), divided.log_weight, -np.inf)
-    return divided._replace(log_weight=weight).normalised, {"skipped": skipped}
+    fused = divided._replace(log_weight=weight).normalised
+    return fused, {"skipped": skipped, "log_eta": log_sum_exp(weight)}
 
 
 def _common_proposal(problem: Problem, params: MixtureExactParams, rng: np.random.Generator) -> Result:

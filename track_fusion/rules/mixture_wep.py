@@ -29,7 +29,15 @@ from track_fusion.linalg import Array
 from track_fusion.params import param
 from track_fusion.rules import covariance_intersection
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
-from track_fusion.rules.mixture_common import Generators, Step, fold_mixtures, fuse_sampled
+from track_fusion.rules.mixture_common import (
+    Generators,
+    Step,
+    either,
+    fold_mixtures,
+    fuse_sampled,
+    has_one_component,
+    heaviest,
+)
 from track_fusion.rules.mixture_quotients import QuotientParams, sample_mixands
 from track_fusion.rules.pairwise import share_of_first
 
@@ -83,7 +91,7 @@ def fuse(tracks: SourceTracks, params: MixtureWepParams) -> FusedTracks:
     ------
     ValueError     given weights do not fit, or a component has no covariance
 
-    Notes          One component each: the geometric average of Gaussians, without sampling. Equal
+    Notes          One component of any weight each: the geometric average of Gaussians, without sampling. Equal
                    mixtures come back, and weights 0 and 1 give a source itself. Else sampled: moments vary with the
                    seed by about a standard deviation over the root of the number of effective samples.
                    No guarantee for mixtures: naive_bayes, for one, claims half of P for two copies of a track
@@ -109,11 +117,23 @@ def fuse(tracks: SourceTracks, params: MixtureWepParams) -> FusedTracks:
 def _fuse_pair(
     first: Mixture, second: Mixture, params: MixtureWepParams, rng: np.random.Generator, share: float | None
 ) -> Step:
-    lead = first.weight.shape[:-1]
-    if first.count == second.count == 1 and params.method not in ("pcci", "naive_bayes"):
-        return _fuse_gaussians(first, second, params.criterion, share)
     if params.method == "naive_bayes":
         return _multiply(first, second)
+    if params.method == "pcci":
+        return _sample_pair(first, second, params, rng, share)
+    single = has_one_component(first) & has_one_component(second)
+    if single.all():
+        return _fuse_gaussians(heaviest(first), heaviest(second), params.criterion, share)
+    sampled = _sample_pair(first, second, params, rng, share)
+    if not single.any():
+        return sampled
+    return either(single, _fuse_gaussians(heaviest(first), heaviest(second), params.criterion, share), sampled)
+
+
+def _sample_pair(
+    first: Mixture, second: Mixture, params: MixtureWepParams, rng: np.random.Generator, share: float | None
+) -> Step:
+    lead = first.weight.shape[:-1]
     given = None if share is None else np.full(lead, share)
     proposal = PROPOSALS[params.omega_proposal](first, second)
     found = optimise_omega(first, second, rng, params.samples, params.criterion, given, proposal)
@@ -128,9 +148,10 @@ def _fuse_pair(
     ends = (found.omega == 0.0) | (found.omega == 1.0) | same(first, second)
     inside = found._replace(omega=np.where(ends, 0.5, found.omega))
     fused, more = METHODS[params.method](first, second, inside, params, rng)
-    info |= more
-    fused = chosen(ends, chosen(found.omega > 0.0, first, second), fused)
-    return Step(fused, None if params.method == "pcci" else found.omega, info)
+    omega = None if params.method == "pcci" else found.omega
+    known = {"ess": np.ones(lead), "log_eta": np.zeros(lead), "pruned": np.zeros(lead)}
+    answer = Step(chosen(found.omega > 0.0, first, second), omega, info | known)
+    return either(ends, answer, Step(fused, omega, info | more))
 
 
 #: What Algorithm 1 draws from.
