@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from track_fusion.params import unknown_name_error
 from track_fusion.scenarios import (
+    ahmed_maneuver,
     ahmed_proposals,
     ahmed_random,
     ahmed_search,
@@ -47,6 +48,7 @@ _MODULES = (
     ahmed_random,
     ahmed_proposals,
     ahmed_search,
+    ahmed_maneuver,
     sharma_gaussians,
     sharma_mixtures,
     sharma_scalar,
