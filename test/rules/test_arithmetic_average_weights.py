@@ -24,33 +24,7 @@ def gaussian(mean: Array, cov: Array) -> Mixture:
     return Mixture(np.ones((*mean.shape[:-1], 1)), mean[..., None, :], cov[..., None, :, :])
 
 
-# Target (39) ----------------------------------------------------------------------------------------------------------
-
-FOUR_MEANS, FOUR_COVS = (
-    np.array([[40.0], [50.0], [60.0], [100.0]]),
-    np.array([400.0, 200.0, 100.0, 400.0])[:, None, None],
-)
-
-
-@pytest.mark.parametrize(
-    ("target", "moments", "weights"),
-    [
-        ((60.0, 200.0), (60.0, 200.0), None),  # the optimum is a segment: only its moments are known
-        ((70.0, 100.0), (61.36, 162.82), (0.0, 0.0, 0.966, 0.034)),
-        ((85.0, 150.0), (89.05, 635.98), (0.0, 0.0, 0.2738, 0.7262)),
-        ((110.0, 300.0), (100.0, 400.0), (0.0, 0.0, 0.0, 1.0)),
-    ],
-)
-def test_figure_2_of_li(
-    target: tuple[float, float], moments: tuple[float, float], weights: tuple[float, ...] | None
-) -> None:
-    extras = {"target": gaussian(np.array([target[0]]), np.array([[target[1]]]))}
-    fused = fuse(FOUR_MEANS, FOUR_COVS, extras, criterion="target")
-    assert fused.info["converged"]
-    assert fused.mean[0] == pytest.approx(moments[0], abs=6e-3)
-    assert fused.cov[0, 0] == pytest.approx(moments[1], abs=6e-3)
-    if weights is not None:
-        np.testing.assert_allclose(fused.weights, weights, atol=1e-4)
+# Target (39), on Fig. 2 of Li 2022: test/library/test_scenario_li2022_target_fit.py ---------------------------------
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])

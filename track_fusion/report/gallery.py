@@ -6,29 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from track_fusion.linalg import Array
 from track_fusion.report.chart import ellipse
-from track_fusion.rules import RULES, Rule, SourceTracks
+from track_fusion.rules import Rule
+from track_fusion.scenarios.li2022_four_cases import SEPARATIONS, enough_for_two, two_tracks
 
-#: The densities of Fig. 1 are not printed. This pair is assumed: trace-optimal covariance intersection gives it the
-#: paper's weight w1 = .3764.
-COVS = np.array([[[4.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, 2.4163]]])
-#: Distance of the means along x and half of it along y, from near to far: cases (a) to (d).
-SEPARATIONS = (0.5, 2.0, 4.5, 8.0)
 RULES_A_PANEL = 5
 COLORS = ("tab:blue", "tab:red", "tab:green", "tab:purple", "tab:orange")
-
-
-def drawn_rules() -> list[Rule]:
-    """Rules that two tracks are enough for, in the order of the registry."""
-    return [rule for rule in RULES.values() if not rule.needed(rule.params())]
-
-
-def two_tracks(separation: float) -> SourceTracks:
-    """Make the pair with its means so far apart."""
-    return SourceTracks(np.array([[0.0, 0.0], [separation, 0.5 * separation]]), COVS)
 
 
 def draw_rules(path: Path) -> list[str]:
@@ -42,15 +26,15 @@ def draw_rules(path: Path) -> list[str]:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    rules = drawn_rules()
+    rules = enough_for_two()
     groups = [rules[i : i + RULES_A_PANEL] for i in range(0, len(rules), RULES_A_PANEL)]
     shape = len(groups), len(SEPARATIONS)
     figure, panels = plt.subplots(*shape, figsize=(15, 2.9 * len(groups)), constrained_layout=True, squeeze=False)
     for row, group in zip(panels, groups, strict=True):
-        for axes, separation in zip(row, SEPARATIONS, strict=True):
+        for axes, separation in zip(row, SEPARATIONS.values(), strict=True):
             _panel(axes, group, separation)
         row[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=9, frameon=False)
-    for axes, letter, separation in zip(panels[0], "abcd", SEPARATIONS, strict=True):
+    for axes, (letter, separation) in zip(panels[0], SEPARATIONS.items(), strict=True):
         axes.set_title(f"({letter}) means {separation:g} apart along x")
     figure.savefig(path, dpi=100)
     plt.close(figure)
