@@ -34,6 +34,8 @@ TEST = [
     "hypothesis>=6.90",
     "mpmath>=1.2",
     "pyriemann>=0.9,<0.12",  # 0.12 asks for NumPy 1.25 but needs 2
+    "scikit-learn>=1.4",
+    "stonesoup>=1.4",
     "pyyaml>=6",
     *SCENARIOS,
     "cyclonedds>=0.10.5; platform_machine == 'x86_64'",

@@ -12,7 +12,7 @@ from track_fusion.rules.mixture_hybrid import MixtureHybridParams
 from track_fusion.rules.naive import NaiveParams
 from track_fusion.rules.split_covariance_intersection import SplitCovarianceIntersectionParams
 from track_fusion.scenarios.base import RuleChoice, judged_claims
-from track_fusion.scenarios.li2019 import exact_geometric
+from track_fusion.scenarios.li2019 import exact_geometric, intensity, scalar_mixture
 from track_fusion.scenarios.li2019_six_sensors import (
     AA,
     AVERAGE,
@@ -23,7 +23,8 @@ from track_fusion.scenarios.li2019_six_sensors import (
     X,
     by_rule,
     least_mass,
-    masses_on_grid,
+    of_mixtures,
+    on_grid,
     scan,
     trials,
 )
@@ -104,15 +105,15 @@ def test_masses_of_the_arithmetic_average_component_by_component(some):
     parts, _ = some
     found = by_rule(AVERAGE, 4)(parts)
     near_any = np.abs(X[:, None] - TARGETS).min(-1) < 15
-    for run in range(len(found)):
+    for run in range(8):
         near, intensity = np.zeros(5), np.zeros(len(X))
         for components in _lists(parts, run)[:4]:
             for weight, place in components:
                 one = norm(place, 5.0)
                 near += weight / 4 * (one.cdf(TARGETS + 8) - one.cdf(TARGETS - 8))
                 intensity += weight / 4 * one.pdf(X)
-        np.testing.assert_allclose(found[run, :5], near, rtol=1e-9)
-        assert found[run, 5] == pytest.approx(intensity[~near_any].sum() * 0.5, abs=2e-3)
+        np.testing.assert_allclose(found.near[run], near, rtol=1e-9)
+        assert found.far[run] == pytest.approx(intensity[~near_any].sum() * 0.5, abs=2e-3)
 
 
 def test_masses_of_the_geometric_averages_point_by_point(some):
@@ -120,7 +121,7 @@ def test_masses_of_the_geometric_averages_point_by_point(some):
     parts, _ = some
     rule = by_rule(RuleChoice("mixture_hybrid", MixtureHybridParams(max_components=20)))(parts)
     exact = exact_geometric(parts, X)
-    for run in range(len(rule)):
+    for run in range(8):
         approximate, product, number = np.ones(len(X)), np.ones(len(X)), 0.0
         for components in _lists(parts, run):
             total = sum(w for w, _ in components)
@@ -128,8 +129,10 @@ def test_masses_of_the_geometric_averages_point_by_point(some):
             approximate *= sum(d ** (1 / 6) for d in densities)
             product *= sum(densities) ** (1 / 6)
             number += total / 6
-        wanted = masses_on_grid(number * approximate[None] / (approximate.sum() * 0.5))[0]
-        np.testing.assert_allclose(rule[run], wanted, atol=0.01)
+        wanted = on_grid(number * approximate[None] / (approximate.sum() * 0.5))
+        np.testing.assert_allclose(rule.near[run], wanted.near[0], atol=0.01)
+        assert rule.far[run] == pytest.approx(wanted.far[0], abs=0.01)
+        np.testing.assert_allclose(rule.between[run], wanted.between[0], atol=1e-3)
         np.testing.assert_allclose(exact[run], number * product / (product.sum() * 0.5), rtol=1e-6, atol=1e-12)
 
 
@@ -140,6 +143,13 @@ def test_half_the_mass_of_a_target_that_all_see():
     parts, seen = trials(range(3), 0, certain=True)
     assert seen.all()
     assert ((parts.weight > 0).sum(-1) >= 5).all()
+
+
+def test_two_targets_are_mixed_when_half_way_is_higher():
+    one, two = (scalar_mixture(np.ones((1, 2)), np.array([m]), np.full((1, 2), 25.0)) for m in ([28, 33], [20, 40]))
+    assert of_mixtures(one).mixed.tolist() == [True]
+    assert of_mixtures(two).mixed.tolist() == [False]
+    assert on_grid(intensity(one, X)).mixed.tolist() == [True]
 
 
 def test_claims(measured):

@@ -197,10 +197,14 @@ def charts(samples: Samples) -> list[Chart]:
         if averages:
             found.append(_variance_chart(title, pair, averages))
             lines = tuple(_contours(a, pair.errors(a, CHART_WEIGHT, CHART_THETA), LEVELS) for a in averages)
-            found.append(_plane(f"{title}: mean square error", lines))
+            lines_at = ", ".join(f"{level:g}" for level in LEVELS)
+            found.append(_plane(f"{title}: mean square error (lines at {lines_at})", lines))
         if len(averages) == 2:
-            excess = Contours("", CHART_WEIGHT, CHART_THETA, pair.excess(CHART_WEIGHT, CHART_THETA), EXCESS_LEVELS)
-            found.append(_plane(f"{title}: mean square error, arithmetic minus geometric", (excess,)))
+            inner = CHART_WEIGHT[1:-1]  # at both ends the averages are equal
+            excess = pair.excess(inner, CHART_THETA)
+            levels = [level for level in EXCESS_LEVELS if excess.min() < level < excess.max()]
+            levelled = tuple(Contours(f"{level:+g}", inner, CHART_THETA, excess, (level,)) for level in levels)
+            found.append(_plane(f"{title}: mean square error, arithmetic minus geometric", levelled))
     if f"{GA}@appendix/mean_1" in samples:
         found.append(_appendix_chart())
     return found

@@ -169,7 +169,7 @@ CLAIMS = (
     ),
     *(
         Claim.order(
-            f"Component by component, too: its heaviest at target {k} outweighs each of the arithmetic average's.",
+            f"The heaviest component of the geometric average at target {k} outweighs each of the arithmetic.",
             "Remark 9",
             f"{AA}/component{theirs}_weight_1",
             f"{GA}/component{ours}_weight_1",
