@@ -127,8 +127,11 @@ class Evaluation:
         errors = np.array([s[3] for s in samples]).reshape(-1, self._layout.size)
         found = consistency(np.array([s[4] for s in samples]), self._layout.size)
         figures: dict[str, Any] = {"samples": len(samples)}
-        for name, at, unit in (("position", self._layout.position, "m"), ("velocity", self._layout.velocity, "mps")):
-            norm = np.linalg.norm(errors[:, list(at)], axis=1)
+        rate = tuple(i for i, name in enumerate(self._layout.axes) if name == "turn_rate")
+        quantities = [("position", self._layout.position, "m", 1.0), ("velocity", self._layout.velocity, "mps", 1.0)]
+        quantities += [("turn_rate", rate, "degps", float(np.degrees(1.0)))] if rate else []
+        for name, at, unit, factor in quantities:
+            norm = factor * np.linalg.norm(errors[:, list(at)], axis=1)
             figures[f"{name}_rmse_{unit}"] = _number(np.sqrt((norm**2).mean()) if len(norm) else math.nan)
             figures[f"{name}_armse_{unit}"] = _number(norm.mean() if len(norm) else math.nan)
         figures |= {

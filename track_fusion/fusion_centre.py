@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +12,11 @@ from numpy.typing import NDArray
 from track_fusion.association.assignment import assign, nearest_neighbour
 from track_fusion.association.gate import gate
 from track_fusion.chi_square import chi_square_quantile
-from track_fusion.filters.kalman import predict
+from track_fusion.filters.extended import predict
 from track_fusion.linalg import Array, is_positive_definite
-from track_fusion.models.motion import NearlyConstantVelocity
+from track_fusion.models.base import Motion
 from track_fusion.params import ParameterError, Params, param
+from track_fusion.random_streams import RandomParams
 from track_fusion.rules import RULES, FusedTracks, Mixture, Rule, SourceTracks
 from track_fusion.track_manager import Bools, Changes, TrackManager, TrackManagerParams
 from track_fusion.tracks import COASTED, CONFIRMED, TrackBatch
@@ -34,6 +36,12 @@ class FusionCentreParams(Params):
     """What takes part in a fusion and how it is associated."""
 
     state_fusion: str = param("covariance_intersection", "the fusion rule", choices=tuple(RULES))
+    association: str = param(
+        "nearest",
+        "nearest: global nearest neighbour within the gate; single_target: all sources are known to track one and the "
+        "same target, so that the first track of each is taken without a gate",
+        choices=("nearest", "single_target"),
+    )
     gate_probability: float = param(
         0.99,
         "share of true pairs of tracks inside the gate (chi-square over all axes)",
@@ -52,6 +60,13 @@ class FusionCentreParams(Params):
         "published stays conservative only by a rule that is so for every cross-correlation",
     )
     publish_tentative: bool = param(False, "publish central tracks before they are confirmed, too")
+    particle_variances: tuple[float, ...] = param(
+        (),
+        "added to the variances of particles taken as one Gaussian, one number an axis, SI units squared: particles "
+        "that have collapsed onto a few points have a singular covariance",
+        low=0.0,
+        kind=float,
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,37 +94,48 @@ class FusionCentre:
     Parameters
     ----------
     sources : int
-    motion : NearlyConstantVelocity    predicts source and central tracks; its layout is the centre's
+    motion : Motion                    predicts source and central tracks; its layout is the centre's
     frame_id : str
     params : FusionCentreParams
     rule_params : Params               of the rule `params.state_fusion`; None = its defaults
     manager_params : TrackManagerParams
     rule : Rule                        in place of the one that `params` names: one that the registry learned later
+    random : RandomParams              what rules that sample draw from, step after step
 
     Raises
     ------
-    ParameterError    the rule needs what source tracks do not bring, such as their cross-covariance
+    ParameterError    the rule needs what source tracks do not bring, such as their cross-covariance; not one number an
+                      axis in `particle_variances`
     """
 
     def __init__(
         self,
         sources: int,
-        motion: NearlyConstantVelocity,
+        motion: Motion,
         frame_id: str,
         params: FusionCentreParams,
         rule_params: Params | None = None,
         manager_params: TrackManagerParams | None = None,
         rule: Rule | None = None,
+        random: RandomParams | None = None,
     ) -> None:
         self.params = params
         self.layout, self.frame_id, self._motion = motion.layout, frame_id, motion
         self.rule = RULES[params.state_fusion] if rule is None else rule
         self._rule_params = self.rule.params() if rule_params is None else rule_params
-        if needed := self.rule.needed(self._rule_params):
+        needed = sorted(set(self.rule.needed(self._rule_params)) - {"seed"})
+        if needed:
             raise ParameterError(
                 f"The 'state_fusion' parameter must be a rule that needs only tracks. Got '{self.rule.key}', "
                 f"which at these parameters needs {', '.join(needed)}: use it in the library or by track-fusion fuse."
             )
+        if len(params.particle_variances) not in (0, self.layout.size):
+            raise ParameterError(
+                f"The 'particle_variances' parameter must hold {self.layout.size} numbers, one an axis, or none. "
+                f"Got {len(params.particle_variances)}."
+            )
+        self._floor = np.diag(params.particle_variances or np.zeros(self.layout.size))
+        self._random = random or RandomParams(role="fusion_centre")
         self._manager_params = manager_params or TrackManagerParams()
         self._gamma = chi_square_quantile(params.gate_probability, self.layout.size)
         self._sources = sources
@@ -119,6 +145,8 @@ class FusionCentre:
         """Forget all tracks and scans."""
         self._manager = TrackManager(self._sources, self.layout, self.frame_id, self._manager_params)
         self._newest: dict[int, TrackBatch] = {}
+        draws = "seed" in (*self.rule.needed(self._rule_params), *self.rule.optional)
+        self._extras = {"seed": self._random.stream()} if draws else {}
 
     @property
     def tracks(self) -> TrackBatch:
@@ -144,8 +172,9 @@ class FusionCentre:
         fresh[list(scans)] = True
         self._newest.update({k: self._selected(scan) for k, scan in scans.items()})
         taking_part = {k: s for k, s in sorted(self._newest.items()) if self._takes_part(k, s, fresh, time_ns)}
-        pool = _Pool.of(taking_part, self._manager.tracks, time_ns, self._motion)
-        target, births = self._associate(pool, fresh)
+        pool = _Pool.of(taking_part, self._manager.tracks, time_ns, self._motion, self._floor)
+        sole = self.params.association == "single_target"
+        target, births = _sole_target(pool, fresh) if sole else self._associate(pool, fresh)
         members = np.flatnonzero(target >= 0)
         target, source = target[members], pool.source[members]
         remembered = np.unique(target[target < len(self._manager.tracks)]) if self.params.memory else target[:0]
@@ -242,7 +271,7 @@ class FusionCentre:
         first = pool.tracks[at[:, 0]].replace(source=np.bitwise_or.reduce(bit, axis=1), existence=existence)
         if at.shape[1] == 1:
             return first, 0
-        fused = self.rule.fuse(pool.gather(at), self._rule_params)
+        fused = self.rule.fuse(pool.gather(at, self._extras), self._rule_params)
         unconverged = int(np.count_nonzero(~np.asarray(fused.info.get("converged", True))))
         weight, mean, cov = _components(fused)
         dof = np.full(len(at), np.inf) if fused.dof is None else fused.dof
@@ -270,11 +299,14 @@ class _Pool:
 
     @classmethod
     def of(
-        cls, scans: Mapping[int, TrackBatch], central: TrackBatch, time_ns: int, motion: NearlyConstantVelocity
+        cls, scans: Mapping[int, TrackBatch], central: TrackBatch, time_ns: int, motion: Motion, floor: Array
     ) -> _Pool:
         batches = [*scans.values(), central]
         tracks = TrackBatch.concatenate([predicted_to(b, time_ns, motion) for b in batches])
         mean, cov = tracks.moments
+        if tracks.components > 1:
+            particles = np.logical_not(tracks.cov.any((1, 2, 3)))
+            cov = np.where(particles[:, None, None], cov + floor, cov)
         sound = conditioned(cov)
         if tracks.components == 1:
             tracks = tracks.replace(cov=sound[:, None])
@@ -289,7 +321,7 @@ class _Pool:
         count = len(self.source)
         return self.mean[:count], self.cov[:count], self.mean[count:], self.cov[count:]
 
-    def gather(self, at: Rows) -> SourceTracks:
+    def gather(self, at: Rows, extras: Mapping[str, Any]) -> SourceTracks:
         """Stack members (M, K) for a rule."""
         dof = self.tracks.dof[at]
         mixture = None
@@ -297,7 +329,16 @@ class _Pool:
             weight = self.tracks.weight[at]
             used = int(np.flatnonzero(weight.any((0, 1)))[-1]) + 1  # the rest pads, say for a central track
             mixture = Mixture(weight[..., :used], self.tracks.mean[at, :used], self.tracks.cov[at, :used])
-        return SourceTracks(self.mean[at], self.cov[at], None if np.isinf(dof).all() else dof, mixture)
+        return SourceTracks(self.mean[at], self.cov[at], None if np.isinf(dof).all() else dof, mixture, extras)
+
+
+def _sole_target(pool: _Pool, fresh: Bools) -> tuple[Rows, int]:
+    """Associate the first track of each source with the one target, which a new scan starts."""
+    target = np.full(len(pool.source), -1, np.intp)
+    births = int(len(pool.tracks) == len(pool.source) and bool(fresh[pool.source].any()))
+    if births or len(pool.tracks) > len(pool.source):
+        target[np.unique(pool.source, return_index=True)[1]] = 0
+    return target, births
 
 
 def _components(fused: FusedTracks) -> tuple[Array, Array, Array]:
@@ -322,22 +363,18 @@ def conditioned(cov: Array) -> Array:
     return cov
 
 
-def predicted_to(batch: TrackBatch, time_ns: int, motion: NearlyConstantVelocity) -> TrackBatch:
-    """Predict every track and component to one time, with process noise.
+def predicted_to(batch: TrackBatch, time_ns: int, motion: Motion) -> TrackBatch:
+    """Predict every track and component to one time, with process noise, linearised where the motion is not linear.
 
     Raises
     ------
     ValueError    a track is later than `time_ns`
     """
-    if not len(batch):
+    stamps = np.unique(batch.time_ns)
+    if not len(batch) or (len(stamps) == 1 and stamps[0] == time_ns):
         return batch
-    first = int(batch.time_ns[0])
-    if (batch.time_ns == first).all():
-        if first == time_ns:
-            return batch
-        transition, noise = motion.matrices((time_ns - first) / SECOND_NS)
-    else:
-        steps = motion.batch((time_ns - batch.time_ns) / SECOND_NS)
-        transition, noise = steps[0][:, None], steps[1][:, None]
-    mean, cov = predict(batch.mean, batch.cov, transition, noise)
+    mean, cov = np.empty_like(batch.mean), np.empty_like(batch.cov)
+    for stamp in stamps:
+        at = batch.time_ns == stamp
+        mean[at], cov[at] = predict(batch.mean[at], batch.cov[at], motion.over((time_ns - int(stamp)) / SECOND_NS))
     return batch.replace(mean=mean, cov=cov, time_ns=np.full(len(batch), time_ns))

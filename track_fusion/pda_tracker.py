@@ -101,6 +101,7 @@ class PdaTracker:
 
     def __init__(self, motion: Motion, sensor: RangeBearingSensor, frame_id: str, params: PdaTrackerParams) -> None:
         self.motion, self.sensor, self.frame_id, self.params = motion, sensor, frame_id, params
+        self.layout = motion.layout
         self._gamma = chi_square_quantile(params.gate_probability, len(sensor.noise))
         self.reset()
 
@@ -109,13 +110,14 @@ class PdaTracker:
         self.tracks = PdaTracks.none(self.motion.layout.size, len(self.sensor.noise))
         self.time_ns = -1
 
-    def step(self, time_ns: int, values: Array) -> TrackBatch:
+    def step(self, time_ns: int, values: Array, covs: Array | None = None) -> TrackBatch:
         """Predict to a scan and update with it.
 
         Parameters
         ----------
         time_ns : int      not before the last one
         values : (D, 2)    range and bearing of all detections; none is a scan too
+        covs : (D, 2, 2)   not used: the sensor's noise is that of every detection
 
         Returns
         -------

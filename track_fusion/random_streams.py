@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import zlib
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from track_fusion.linalg import Array
+from track_fusion.params import Params, param
 
 
 def stream(seed: int, run: int, role: str) -> np.random.Generator:
@@ -16,6 +18,21 @@ def stream(seed: int, run: int, role: str) -> np.random.Generator:
     Draw from it step by step: n draws of one step after another equal one draw of all steps.
     """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(run, zlib.crc32(role.encode()))))
+
+
+@dataclasses.dataclass(frozen=True)
+class RandomParams(Params):
+    """Whose random numbers are drawn: those of a stream of its own for each seed, run and role."""
+
+    seed: int = param(0, "seed of the random streams", low=0)
+    run: int = param(0, "index of the Monte Carlo run", low=0)
+    role: str = param(
+        "", "name of the stream; those who work together need different ones. Empty: made from the node's"
+    )
+
+    def stream(self) -> np.random.Generator:
+        """Return the generator, at its beginning."""
+        return stream(self.seed, self.run, self.role)
 
 
 #: One generator for a single run, or one for each run of a batch, whose first leading axis counts the runs.

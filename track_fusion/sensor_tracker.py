@@ -6,27 +6,40 @@ import dataclasses
 
 import numpy as np
 
-from track_fusion.filters.kalman import predict, update
-from track_fusion.linalg import Array, mahalanobis_squared
-from track_fusion.models.measurement import LinearSensor
-from track_fusion.models.motion import NearlyConstantVelocity
+from track_fusion.linalg import Array, mahalanobis_squared, transpose
+from track_fusion.models.base import Motion, Sensor
+from track_fusion.models.choices import SENSORS, MotionChoice, square_matrix
+from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.params import ParameterError, Params, param
-from track_fusion.tracks import COASTED, CONFIRMED, TrackBatch
+from track_fusion.track_filters import TRACK_FILTERS, TrackFilter
+from track_fusion.tracks import COASTED, CONFIRMED, StateLayout, TrackBatch
 
 SECOND_NS = 1_000_000_000
+#: The tracker of any number of targets in clutter, pda_tracker.py.
+MULTI_TARGET = "pda"
+
+
+@dataclasses.dataclass(frozen=True)
+class TrackerChoice(MotionChoice):
+    """What a tracker consists of; each choice has parameters of its own."""
+
+    sensor: str = param(
+        "position",
+        "what a detection holds: position = the position axes, range_bearing = range and bearing, "
+        "linear = the axes of the state that sensor_axes names",
+        choices=tuple(SENSORS),
+    )
+    filter: str = param(
+        "kalman",
+        "the filter of the one target; or pda: any number of targets in clutter, by probabilistic data association",
+        choices=(*TRACK_FILTERS, MULTI_TARGET),
+    )
 
 
 @dataclasses.dataclass(frozen=True)
 class SensorTrackerParams(Params):
-    """Filter, sensor and initial state of a single-target tracker."""
+    """Initial state of a single-target tracker (every filter but pda)."""
 
-    filter: str = param("kalman", "the filter", choices=("kalman",))
-    sensor: str = param(
-        "position", "what a detection holds: position = the position axes, in metres", choices=("position",)
-    )
-    sensor_sd: float = param(
-        1.0, "standard deviation of a detection that brings no covariance", unit="m", low=0.0, strict=True
-    )
     initial_mean: tuple[float, ...] = param(
         (), "state at initial_stamp_s in the order of the axes; empty: start from the first detection", kind=float
     )
@@ -39,26 +52,64 @@ class SensorTrackerParams(Params):
         low=0.0,
         strict=True,
     )
+    initial_turn_rate_sd: float = param(
+        0.1,
+        "standard deviation of the unknown turn rate, and of any further axis, when starting from a detection",
+        unit="rad/s",
+        low=0.0,
+        strict=True,
+    )
     track_id: int = param(1, "identifier of the track", low=0, high=0xFFFFFFFF)
 
 
+@dataclasses.dataclass(frozen=True)
+class _OfDetection:
+    """A sensor with the noise that a detection brought."""
+
+    sensor: Sensor
+    noise: Array
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        return self.sensor.axes
+
+    def observe(self, state: Array) -> Array:
+        return self.sensor.observe(state)
+
+    def jacobian(self, state: Array) -> Array:
+        return self.sensor.jacobian(state)
+
+    def residual(self, z: Array, expected: Array) -> Array:
+        return self.sensor.residual(z, expected)
+
+
 class SensorTracker:
-    """Tracks one target with a Kalman filter.
+    """Tracks one target with a filter.
 
     Parameters
     ----------
-    motion : NearlyConstantVelocity    its layout is the tracker's
+    motion : Motion           its layout is the tracker's
+    sensor : Sensor           of that layout
+    track_filter : TrackFilter
     frame_id : str
     params : SensorTrackerParams
 
     Raises
     ------
-    ParameterError    the initial state does not fit the layout, or its covariance is not positive definite
+    ParameterError    the initial state does not fit the layout, or its covariance is not positive definite; there is
+                      none, and the sensor does not see positions
     """
 
-    def __init__(self, motion: NearlyConstantVelocity, frame_id: str, params: SensorTrackerParams) -> None:
-        self.motion, self.layout, self.frame_id, self.params = motion, motion.layout, frame_id, params
-        self.sensor = LinearSensor.position(motion.layout, params.sensor_sd)
+    def __init__(
+        self, motion: Motion, sensor: Sensor, track_filter: TrackFilter, frame_id: str, params: SensorTrackerParams
+    ) -> None:
+        self.motion, self.sensor, self.filter = motion, sensor, track_filter
+        self.layout, self.frame_id, self.params = motion.layout, frame_id, params
+        if not params.initial_mean and not _sees_position(sensor, self.layout):
+            raise ParameterError(
+                "The 'initial_mean' parameter must be given: from detections of "
+                f"{', '.join(sensor.axes)} alone no track can start."
+            )
         self.reset()
 
     def reset(self) -> None:
@@ -67,22 +118,21 @@ class SensorTracker:
         self._provenance = np.uint32(0)
 
     def _initial(self) -> TrackBatch:
-        n, mean, cov = self.layout.size, np.array(self.params.initial_mean), np.array(self.params.initial_cov)
+        n, mean = self.layout.size, np.array(self.params.initial_mean)
         if mean.shape != (n,):
             raise ParameterError(f"The 'initial_mean' parameter must hold {n} numbers, one an axis. Got {len(mean)}.")
-        if cov.size not in (n, n * n):
-            raise ParameterError(f"The 'initial_cov' parameter must hold {n} or {n * n} numbers. Got {cov.size}.")
-        square = np.diag(cov) if cov.size == n else cov.reshape(n, n)
+        square = square_matrix("initial_cov", self.params.initial_cov, n)
         try:
-            return self._batch(mean, square, round(self.params.initial_stamp_s * SECOND_NS), CONFIRMED)
+            return self._begun(mean, square, round(self.params.initial_stamp_s * SECOND_NS))
         except ValueError as error:
             raise ParameterError(f"The 'initial_cov' parameter does not fit: {error}") from None
 
-    def _batch(self, mean: Array, cov: Array, time_ns: int, status: int) -> TrackBatch:
-        return TrackBatch.gaussian(
+    def _begun(self, mean: Array, cov: Array, time_ns: int) -> TrackBatch:
+        track = TrackBatch.gaussian(
             self.layout, self.frame_id, mean[None], cov[None],
-            time_ns=time_ns, track_id=np.array([self.params.track_id]), status=status,
+            time_ns=time_ns, track_id=np.array([self.params.track_id]), status=CONFIRMED,
         )  # fmt: skip
+        return self.filter.begin(track)
 
     @property
     def time_ns(self) -> int:
@@ -105,17 +155,15 @@ class SensorTracker:
         if self._track is None:
             self._track = self._started(time_ns, values, covs)
             return self._track if self._track is not None else TrackBatch.empty(self.layout, self.frame_id)
-        transition, noise = self.motion.matrices((time_ns - self.time_ns) / SECOND_NS)
-        mean, cov = predict(self._track.mean[0, 0], self._track.cov[0, 0], transition, noise)
+        track = self.filter.predict(self._track, self.motion.over((time_ns - self.time_ns) / SECOND_NS))
         if len(values):
             noises = (
                 np.broadcast_to(self.sensor.noise, (len(values), *self.sensor.noise.shape)) if covs is None else covs
             )
-            at = self._nearest(mean, cov, values, noises) if len(values) > 1 else 0
-            mean, cov, _ = update(mean, cov, values[at], self.sensor.matrix, noises[at])
-        self._track = self._track.replace(
-            mean=mean[None, None],
-            cov=cov[None, None],
+            at = self._nearest(track, values, noises) if len(values) > 1 else 0
+            sensor = self.sensor if covs is None else _OfDetection(self.sensor, noises[at])
+            track = self.filter.update(track, values[at], sensor)
+        self._track = track.replace(
             time_ns=np.array([time_ns]),
             status=np.array([CONFIRMED if len(values) else CONFIRMED | COASTED], np.uint8),
             source=np.array([self._provenance]),
@@ -125,27 +173,42 @@ class SensorTracker:
     def _started(self, time_ns: int, values: Array, covs: Array | None) -> TrackBatch | None:
         if not len(values):
             return None
-        mean = values[0] @ self.sensor.matrix
-        cov = np.eye(self.layout.size) * self.params.initial_speed_sd**2
-        at = np.array(self.layout.position)
-        cov[at[:, None], at] = self.sensor.noise if covs is None else covs[0]
-        return self._batch(mean, cov, time_ns, CONFIRMED)
+        noise = self.sensor.noise if covs is None else covs[0]
+        mean, cov = np.zeros(self.layout.size), self.params.initial_turn_rate_sd**2 * np.eye(self.layout.size)
+        cov[self.layout.velocity, self.layout.velocity] = self.params.initial_speed_sd**2
+        at, mean[at], cov[np.ix_(at, at)] = _seen(self.sensor, self.layout, values[0], noise)
+        return self._begun(mean, cov, time_ns)
 
-    def _nearest(self, mean: Array, cov: Array, values: Array, noises: Array) -> int:
-        matrix = self.sensor.matrix
-        return int(np.argmin(mahalanobis_squared(values - matrix @ mean, matrix @ cov @ matrix.T + noises)))
+    def _nearest(self, track: TrackBatch, values: Array, noises: Array) -> int:
+        (mean,), (cov,) = track.moments
+        slope = self.sensor.jacobian(mean)
+        residual = self.sensor.residual(values, self.sensor.observe(mean))
+        return int(np.argmin(mahalanobis_squared(residual, slope @ cov @ transpose(slope) + noises)))
 
     def feed_back(self, fused: TrackBatch) -> bool:
         """Take the fused posterior of the current time for one's own; tell whether there was one.
 
-        Of several fused tracks the statistically nearest is taken; a mixture is merged.
+        Of several fused tracks the statistically nearest is taken; the filter brings it into its own form.
         """
         if self._track is None or not len(fused) or int(fused.time_ns[0]) != self.time_ns:
             return False
-        mean, cov = fused.to_axes(self.layout).moments
-        at = 0
-        if len(mean) > 1:
-            at = int(np.argmin(mahalanobis_squared(mean - self._track.mean[0, 0], cov + self._track.cov[0, 0])))
+        fused, at = fused.to_axes(self.layout), 0
+        if len(fused) > 1:
+            (own_mean,), (own_cov,) = self._track.moments
+            mean, cov = fused.moments
+            at = int(np.argmin(mahalanobis_squared(mean - own_mean, cov + own_cov)))
         self._provenance |= fused.source[at]
-        self._track = self._track.replace(mean=mean[at][None, None], cov=cov[at][None, None])
+        self._track = self.filter.adopt(self._track, fused[at : at + 1])
         return True
+
+
+def _sees_position(sensor: Sensor, layout: StateLayout) -> bool:
+    names = {layout.axes[i] for i in layout.position}
+    return isinstance(sensor, RangeBearingSensor) or names <= set(sensor.axes) <= set(layout.axes)
+
+
+def _seen(sensor: Sensor, layout: StateLayout, z: Array, noise: Array) -> tuple[list[int], Array, Array]:
+    """Tell which axes of the state a detection tells of, d of them, with their values (d,) and covariance (d, d)."""
+    if isinstance(sensor, RangeBearingSensor):
+        return list(layout.indices(("x", "y"))), *sensor.positions(z, noise)
+    return list(layout.indices(sensor.axes)), z, noise

@@ -350,16 +350,16 @@ def _is_clean(batch: TrackBatch) -> bool:
         and (len(ids) == 1 or len(np.unique(ids)) == len(ids))
         and (weight.sum(1).min() > 0 if batch.phd else True)
         and (cov == transpose(cov)).all()
-        and is_positive_definite(cov).all()
+        and (is_positive_definite(cov).all() if cov.any() else (weight > 0).sum(1).min() > 1)
     )
 
 
 def _definite(batch: TrackBatch, cov: Array, size: Array) -> NDArray[np.bool_]:
     """Positive definite throughout, or a particle track: several components, all without covariance."""
-    good = np.asarray(is_positive_definite(symmetrise(cov)).all(1))
-    if good.all():
-        return good
-    return np.asarray(good | ((size == 0) & ((batch.weight > 0).sum(1) > 1)))
+    good = (size == 0) & ((batch.weight > 0).sum(1) > 1)
+    rest = np.flatnonzero(~good)
+    good[rest] = is_positive_definite(symmetrise(cov[rest])).all(1)
+    return np.asarray(good)
 
 
 def _repeated(ids: NDArray[np.int64]) -> NDArray[np.bool_]:

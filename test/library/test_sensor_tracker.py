@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from track_fusion.filters.kalman import predict, update
+from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
-from track_fusion.params import ParameterError
+from track_fusion.params import ParameterError, Params
 from track_fusion.sensor_tracker import SensorTracker, SensorTrackerParams
+from track_fusion.track_filters import TRACK_FILTERS
 from track_fusion.tracks import COASTED, CONFIRMED, StateLayout, TrackBatch, planar_layout
 
 SECOND = 10**9
@@ -15,9 +17,13 @@ MOTION = NearlyConstantVelocity(LAYOUT, MotionParams(process_noise=2.0))
 NOTHING = np.zeros((0, 2))
 
 
-def tracker(layout=LAYOUT, **params):
-    motion = NearlyConstantVelocity(layout, MotionParams(process_noise=2.0))
-    return SensorTracker(motion, "map", SensorTrackerParams(**params))
+def tracker(layout=LAYOUT, sensor_sd=1.0, **params):
+    motion, sensor = (
+        NearlyConstantVelocity(layout, MotionParams(process_noise=2.0)),
+        LinearSensor.position(layout, sensor_sd),
+    )
+    kalman = TRACK_FILTERS["kalman"].make(motion, sensor, Params())
+    return SensorTracker(motion, sensor, kalman, "map", SensorTrackerParams(**params))
 
 
 def known(**params):

@@ -128,8 +128,10 @@ class RangeBearingSensor:
         """Return z - expected, (..., 2), the bearing wrapped."""
         return wrapped_residual(z, expected, self._angular)
 
-    def positions(self, z: Array) -> tuple[Array, Array]:
+    def positions(self, z: Array, noise: Array | None = None) -> tuple[Array, Array]:
         """Turn detections into positions (..., 2) with covariances (..., 2, 2), by linearisation.
+
+        `noise`, (2, 2), stands for the sensor's own.
 
         Its bias along the range, r sd^2 / 2, is neglected.
         """
@@ -137,7 +139,7 @@ class RangeBearingSensor:
         unit = np.stack([np.cos(bearing), np.sin(bearing)], -1)
         across = np.stack([-unit[..., 1], unit[..., 0]], -1) * r[..., None]
         factor = np.stack([unit, across], -1)
-        cov = factor @ self.noise @ np.swapaxes(factor, -1, -2)
+        cov = factor @ (self.noise if noise is None else noise) @ np.swapaxes(factor, -1, -2)
         return self.location + r[..., None] * unit, 0.5 * (cov + np.swapaxes(cov, -1, -2))
 
 

@@ -52,6 +52,7 @@ class NearlyConstantVelocity:
             position[p, p] = velocity[v, v] = cross[p, v] = cross[v, p] = self._drift[p, v] = 1.0
         self._noise = np.stack([position, cross, velocity])
         self.matrices = lru_cache(maxsize=256)(self._matrices)
+        self.over = lru_cache(maxsize=256)(self._over)
 
     def _matrices(self, dt: float) -> tuple[Array, Array]:
         """Return F and Q, each (n, n), over dt seconds."""
@@ -90,6 +91,6 @@ class NearlyConstantVelocity:
                 columns.append(second)
         return np.stack(columns, 1)
 
-    def over(self, dt: float) -> Transition:
+    def _over(self, dt: float) -> Transition:
         """Return the motion over dt seconds."""
         return Transition.linear(*self.matrices(dt), self.noise_factor(dt))

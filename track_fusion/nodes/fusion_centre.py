@@ -18,11 +18,12 @@ from msg_adapters.markers import markers_to_msg
 from msg_adapters.odometry import CrossBlock, odometry_from_msg, odometry_to_msgs
 from msg_adapters.track_table import track_table_from_msg, track_table_to_msg
 from track_fusion.fusion_centre import FusionCentre, FusionCentreParams, StepInfo
-from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
+from track_fusion.models.choices import MOTIONS, MotionChoice
 from track_fusion.nodes.frames import FrameParams, screened_tracks
 from track_fusion.nodes.managed import ManagedNode, end, run
-from track_fusion.nodes.ros_params import declare
+from track_fusion.nodes.ros_params import chosen, declare
 from track_fusion.params import ParameterError, Params, param
+from track_fusion.random_streams import RandomParams
 from track_fusion.rules import RULES
 from track_fusion.scan_buffer import ScanBuffer, ScanBufferParams
 from track_fusion.track_manager import TrackManagerParams
@@ -80,12 +81,12 @@ class FusionCentreNode(ManagedNode):
     def declare_parameters_(self) -> None:
         """Declare parameters and build the centre."""
         self.frame, self.sources = declare(self, FrameParams), declare(self, SourceParams)
-        motion = NearlyConstantVelocity(StateLayout(self.frame.axes), declare(self, MotionParams))
+        motion = chosen(self, MOTIONS, declare(self, MotionChoice).motion, StateLayout(self.frame.axes))
         params = declare(self, FusionCentreParams)
         rule_params = {key: declare(self, rule.params, f"{key}.") for key, rule in RULES.items()}
         self.centre = FusionCentre(
             len(self.sources.source_configurations), motion, self.frame.frame_id, params,
-            rule_params[params.state_fusion], declare(self, TrackManagerParams),
+            rule_params[params.state_fusion], declare(self, TrackManagerParams), declare(self, RandomParams),
         )  # fmt: skip
         self._buffer_params = declare(self, ScanBufferParams)
         self.buffer = ScanBuffer([k == "odometry" for k in self.sources.kinds], self._buffer_params)

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import InvalidParameterValueException
 from rclpy.node import Node
 
+from track_fusion.models.choices import Choice, make
 from track_fusion.params import ParameterError, Params, Spec, from_dict, specs, unknown_name_error
+from track_fusion.random_streams import RandomParams
 
 P = TypeVar("P", bound=Params)
+T = TypeVar("T")
 
 #: Parameters that rclpy declares by itself.
 _BUILT_IN = ("use_sim_time", "start_type_description_service")
@@ -23,7 +27,8 @@ _WIDEST = {float: 1.7e308, int: 2**63 - 1}
 def declare(node: Node, cls: type[P], prefix: str = "") -> P:
     """Declare every field of a parameter dataclass on a node and return it with the values given.
 
-    The parameters are read-only: they take effect at start-up.
+    The parameters are read-only: they take effect at start-up. The role of random numbers is the node's name unless
+    given.
 
     Raises
     ------
@@ -39,10 +44,22 @@ def declare(node: Node, cls: type[P], prefix: str = "") -> P:
         except InvalidParameterValueException:  # the range of the descriptor; the dataclass says more
             given = node._parameter_overrides[full].value
         values[name] = default if given is None else given
+    if issubclass(cls, RandomParams):
+        values["role"] = values["role"] or node.get_name()
     try:
         return from_dict(cls, values)
     except ParameterError as error:
         raise ParameterError(str(error).replace("The '", f"The '{prefix}", 1)) from None
+
+
+def chosen(node: Node, table: Mapping[str, Choice[T]], key: str, *before: Any) -> T:
+    """Declare the parameters of one choice of a table, and of no other; make it from (*before, parameters).
+
+    Raises
+    ------
+    ParameterError    a value is wrong, or the choice does not fit, say the axes
+    """
+    return make(table, key, declare(node, table[key].params), *before)
 
 
 def _descriptor(name: str, spec: Spec) -> ParameterDescriptor:

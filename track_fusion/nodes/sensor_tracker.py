@@ -14,12 +14,15 @@ from msg_adapters.detection_table import detection_table_from_msg
 from msg_adapters.header import check_header
 from msg_adapters.odometry import odometry_to_msgs
 from msg_adapters.track_table import track_table_from_msg, track_table_to_msg
-from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
+from track_fusion.models.choices import MOTIONS, SENSORS
+from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.nodes.frames import FrameParams, screened_detections, screened_tracks
 from track_fusion.nodes.managed import ManagedNode, end, run
-from track_fusion.nodes.ros_params import declare
-from track_fusion.params import Params, param
-from track_fusion.sensor_tracker import SensorTracker, SensorTrackerParams
+from track_fusion.nodes.ros_params import chosen, declare
+from track_fusion.params import ParameterError, Params, param
+from track_fusion.pda_tracker import PdaTracker, PdaTrackerParams
+from track_fusion.sensor_tracker import MULTI_TARGET, SensorTracker, SensorTrackerParams, TrackerChoice
+from track_fusion.track_filters import TRACK_FILTERS
 from track_fusion.tracks import StateLayout, TrackBatch
 
 #: How often a tracker that waits for feedback looks at its deadline.
@@ -41,7 +44,7 @@ class FeedbackParams(Params):
 
 
 class SensorTrackerNode(ManagedNode):
-    """Carries messages to a :class:`track_fusion.sensor_tracker.SensorTracker`.
+    """Carries messages to a :class:`track_fusion.sensor_tracker.SensorTracker`, or a multi-target tracker.
 
     With feedback, a scan waits until the fused posterior of the scan before has come back, so that late feedback
     changes nothing.
@@ -50,12 +53,29 @@ class SensorTrackerNode(ManagedNode):
     def declare_parameters_(self) -> None:
         """Declare parameters and build the tracker."""
         self.frame = declare(self, FrameParams)
-        motion = NearlyConstantVelocity(StateLayout(self.frame.axes), declare(self, MotionParams))
-        self.tracker = SensorTracker(motion, self.frame.frame_id, declare(self, SensorTrackerParams))
         self.feedback = declare(self, FeedbackParams)
+        self.tracker = self._made(declare(self, TrackerChoice))
         self._queue: deque[DetectionArrays] = deque()
         self._awaited_ns = -1
         self._asked_ns = 0
+
+    def _made(self, choice: TrackerChoice) -> SensorTracker | PdaTracker:
+        """Declare the parameters of motion, sensor and filter, and make the tracker of them."""
+        motion = chosen(self, MOTIONS, choice.motion, StateLayout(self.frame.axes))
+        sensor = chosen(self, SENSORS, choice.sensor, motion.layout)
+        if choice.filter != MULTI_TARGET:
+            track_filter = chosen(self, TRACK_FILTERS, choice.filter, motion, sensor)
+            params = declare(self, SensorTrackerParams)
+            return SensorTracker(motion, sensor, track_filter, self.frame.frame_id, params)
+        if not isinstance(sensor, RangeBearingSensor):
+            raise ParameterError(
+                f"The 'sensor' parameter must be 'range_bearing' with filter {MULTI_TARGET!r}. Got {choice.sensor!r}."
+            )
+        if self.feedback.feedback != "none":
+            raise ParameterError(
+                f"The 'feedback' parameter must be 'none' with filter {MULTI_TARGET!r}. Got {self.feedback.feedback!r}."
+            )
+        return PdaTracker(motion, sensor, self.frame.frame_id, declare(self, PdaTrackerParams))
 
     def connect(self) -> None:
         """Create the topics."""
@@ -91,6 +111,7 @@ class SensorTrackerNode(ManagedNode):
         if stamp_ns != self._awaited_ns:  # of an empty table, too: it says that there is no feedback of its time only
             self.counted["feedback_of_another_time"] += 1
             return
+        assert isinstance(self.tracker, SensorTracker)  # the other takes no feedback
         self.counted["feedback"] += self.tracker.feed_back(batch)
         self._awaited_ns = -1
         self._work()
