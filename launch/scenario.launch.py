@@ -1,6 +1,6 @@
 """Run a published scenario: replay, one tracker a sensor, the fusion centre and the evaluator.
 
-    ros2 launch track_fusion scenario.launch.py scenario:=li2022-linear rule:=covariance_intersection
+    ros2 launch track_fusion scenario.launch.py scenario:=li2022-nonlinear rule:=covariance_intersection
 
 All parameters come from config/<scenario>.yaml; an argument that is given overrides the file. The launch ends when the
 replay node does.
@@ -19,10 +19,14 @@ from launch_ros.actions import Node
 PACKAGE = "track_fusion"
 FUSED = "/fusion_centre/tracks"
 END_S = 1.0  # from the end of the replay to that of the rest: the last messages are still to be read
-# Launch arguments that override a parameter of the file: argument, node, parameter, type.
+# Nodes that are no trackers.
+OTHERS = ("fusion_centre", "evaluator", "replay")
+# Launch arguments that override a parameter of the file: argument, node, parameter, type. The seed goes to trackers
+# that draw random numbers, too.
 OVERRIDES = (
     ("rule", "fusion_centre", "state_fusion", str),
     ("seed", "replay", "seed", int),
+    ("seed", "fusion_centre", "seed", int),
     ("pace", "replay", "pace", str),
     ("rate", "replay", "rate", float),
 )
@@ -58,7 +62,9 @@ def scenario_nodes(context):
     """Build the nodes that the scenario's parameter file names."""
     parameter_file = find_parameter_file(LaunchConfiguration("scenario").perform(context))
     names = yaml.safe_load(parameter_file.read_text())
-    sensors = sorted(name for name in names if name.startswith("sensor_"))
+    sensors = [name for name in names if name not in OTHERS]
+    drawing = [s for s in sensors if names[s]["ros__parameters"].get("filter") == "particle"]
+    overrides = (*OVERRIDES, *(("seed", sensor, "seed", int) for sensor in drawing))
     remappings = {
         "replay": [("~/fused", FUSED)],
         "fusion_centre": [(f"~/sources/{sensor}/tracks", f"/{sensor}/tracks") for sensor in sensors],
@@ -66,33 +72,40 @@ def scenario_nodes(context):
     }
     for sensor in sensors:
         remappings[sensor] = [("~/detections", f"/replay/{sensor}/detections"), ("~/feedback", FUSED)]
-    # Replay comes last: by then the others are starting already.
-    nodes = [node(context, name, parameter_file, remappings[name]) for name in (*sensors, "fusion_centre", "evaluator")]
     over = TimerAction(period=END_S, actions=[Shutdown(reason="the replay is over")])
-    return [*nodes, node(context, "replay", parameter_file, remappings["replay"], on_exit=[over])]
+    # Replay comes last: by then the others are starting already.
+    return [
+        node(
+            name,
+            [str(parameter_file), *override_file(context, name, overrides)],
+            remappings[name],
+            **({"on_exit": [over]} if name == "replay" else {}),
+        )
+        for name in (*sensors, *OTHERS)
+    ]
 
 
-def node(context, name, parameter_file, remappings, **options):
+def node(name, parameters, remappings, **options):
     """Build one node; its executable is its name, but for the sensors' trackers."""
     return Node(
         package=PACKAGE,
-        executable="sensor_tracker" if name.startswith("sensor_") else name,
+        executable=name if name in OTHERS else "sensor_tracker",
         name=name,
-        parameters=[str(parameter_file), *override_file(context, name)],
+        parameters=parameters,
         remappings=remappings,
         output="screen",
         **options,
     )
 
 
-def override_file(context, name):
+def override_file(context, name, overrides):
     """Write the launch arguments given for one node to a parameter file of its own.
 
     launch would do the same with a dictionary, but for all nodes ("/**"), and what the first file says of this node
     would win over that when it has a section for all nodes, too.
     """
     given = {}
-    for argument, owner, parameter, kind in OVERRIDES:
+    for argument, owner, parameter, kind in overrides:
         text = LaunchConfiguration(argument).perform(context)
         if owner == name and text:
             given[parameter] = kind(text)

@@ -38,8 +38,11 @@ from msg_adapters.header import stamp_from_ns
 from msg_adapters.odometry import odometry_from_msg, odometry_to_msgs
 from msg_adapters.track_table import track_table_to_msg
 from track_fusion.fusion_centre import FusionCentre, FusionCentreParams
+from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
+from track_fusion.params import Params
 from track_fusion.sensor_tracker import SensorTracker, SensorTrackerParams
+from track_fusion.track_filters import TRACK_FILTERS
 from track_fusion.track_manager import TrackManagerParams
 from track_fusion.tracks import StateLayout, TrackBatch, planar_layout
 
@@ -49,6 +52,7 @@ MAX_FUTURE_S, MAX_DELAY_S = 0.5, 10.0
 PARAMS = PATIENT | {"max_future_s": MAX_FUTURE_S, "max_delay_s": MAX_DELAY_S, "confirmation_threshold": [1, 1]}
 MANAGER = TrackManagerParams(confirmation_threshold=(1, 1))
 MOTION = NearlyConstantVelocity(planar_layout(), MotionParams())
+SENSOR = LinearSensor.position(planar_layout(), 1.0)
 GOOD = np.array([[0.0, 0.0, 1.0, 0.0], [50.0, 0.0, 0.0, 1.0], [0.0, 50.0, -1.0, 0.0]])
 COVS = {"left": np.diag([1.0, 2.0, 0.5, 0.5]), "right": np.diag([2.0, 1.0, 0.25, 1.0])}
 LOAD = 10_000
@@ -358,7 +362,8 @@ def test_a_centre_counts_bad_odometry_and_fuses_the_rest(bench: Bench) -> None:
 
 
 def test_a_tracker_counts_bad_detections_and_tracks_on(bench: Bench) -> None:
-    tracker = SensorTracker(MOTION, "map", SensorTrackerParams())
+    kalman = TRACK_FILTERS["kalman"].make(MOTION, SENSOR, Params())
+    tracker = SensorTracker(MOTION, SENSOR, kalman, "map", SensorTrackerParams())
     base_ns, value = bench.now_ns + SECOND_NS, np.array([[3.0, 4.0]])
     rows: Mapping[str, Any] = {"not_finite": [[NAN, 0.0], [3.0, 4.0]]}
     whole: list[tuple[str, Callable[[Any], None]]] = [
@@ -382,7 +387,8 @@ def test_a_tracker_counts_bad_detections_and_tracks_on(bench: Bench) -> None:
 
 def test_a_tracker_counts_bad_feedback_and_waits_for_the_good(bench: Bench) -> None:
     """Neither bad feedback nor that of another time, an empty table included, stands for the one awaited."""
-    tracker = SensorTracker(MOTION, "map", SensorTrackerParams())
+    kalman = TRACK_FILTERS["kalman"].make(MOTION, SENSOR, Params())
+    tracker = SensorTracker(MOTION, SENSOR, kalman, "map", SensorTrackerParams())
     at_ns, value = bench.now_ns + SECOND_NS, np.array([[3.0, 4.0]])
     bench.tick(at_ns)
     for k in range(2):

@@ -12,34 +12,44 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-#: The demonstration's rules, in the order of the table; the last is recorded and drawn.
-RULES = ("naive", "covariance_intersection", "arithmetic_average")
-QUANTITIES = {"position_armse_m": "position ARMSE / m", "velocity_armse_mps": "velocity ARMSE / m/s"}
+QUANTITIES = {
+    "position_armse_m": "position ARMSE / m",
+    "velocity_armse_mps": "velocity ARMSE / m/s",
+    "turn_rate_armse_degps": "turn rate ARMSE / deg/s",
+}
 
 
 @click.command(short_help="Run a published scenario over real ROS 2 nodes.")
 @click.argument("name", default="li2022-linear")
-@click.option("--rules", default=",".join(RULES), show_default=True, help="Fusion rules, with commas between.")
+@click.option(
+    "--rules",
+    default=None,
+    help="Fusion rules, with commas between; the last is recorded and drawn. By default some of the paper's.",
+)
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0), help="Seed of the random streams.")
 @click.option(
-    "--runs", default=1000, show_default=True, type=click.IntRange(min=2), help="Library runs to compare with."
+    "--runs",
+    default=None,
+    type=click.IntRange(min=2),
+    help="Library runs to compare with; by default what takes seconds.",
 )
 @click.option(
     "--out", default="out/demo", show_default=True, type=click.Path(path_type=Path), help="Where results go; replaced."
 )
-def demo(name: str, rules: str, seed: int, runs: int, out: Path) -> None:
+def demo(name: str, rules: str | None, seed: int, runs: int | None, out: Path) -> None:
     """Run a published scenario by real ROS 2 processes, with each rule, and set it beside the library and the paper.
 
-    Replay, one tracker a sensor, the fusion centre and the evaluator run as processes of their own, in lockstep,
-    the fused posterior fed back to the trackers. Writes a bag (mcap), figures.json and tracks.png.
+    Replay, one tracker a sensor, the fusion centre and the evaluator run as processes of their own, in lockstep, as
+    the parameter file config/NAME.yaml says. Writes a bag (mcap), figures.json and tracks.png.
 
-    Example: track-fusion demo li2022-linear --rules naive,arithmetic_average
+    Examples: track-fusion demo li2022-linear --rules naive,arithmetic_average
+
+    track-fusion demo li2022-nonlinear-sir
     """
     from track_fusion.nodes.demo import demo_of, run_demo
     from track_fusion.nodes.managed import Fault
-    from track_fusion.rules import get_rule
 
-    chosen = tuple(get_rule(r.strip()).key for r in rules.split(","))
+    chosen = tuple(r.strip() for r in rules.split(",")) if rules else ()
     began = time.monotonic()
     console = Console()
     columns = (
@@ -61,14 +71,14 @@ def demo(name: str, rules: str, seed: int, runs: int, out: Path) -> None:
             result = run_demo(planned, progress)
     except Fault as error:
         raise click.ClickException(str(error)) from None
-    for table in _tables(result, planned.rules, runs):
+    for table in _tables(result, planned.row, planned.rules, planned.library_runs):
         console.print(table)
     console.print(
         f"Done in {time.monotonic() - began:.0f} s: {out}/tracks.png, {out}/figures.json, {out}/bag", highlight=False
     )
 
 
-def _tables(result: dict[str, Any], rules: tuple[str, ...], runs: int) -> list[Table]:
+def _tables(result: dict[str, Any], filter_row: str, rules: tuple[str, ...], runs: int) -> list[Table]:
     """One table a quantity: this run over ROS, the same run by the library, many library runs, published."""
     figures = {f["name"]: f for f in result["figures"]}
     tables = []
@@ -81,15 +91,19 @@ def _tables(result: dict[str, Any], rules: tuple[str, ...], runs: int) -> list[T
             table.add_column(column, justify="right", no_wrap=True)
         table.add_column("verdict", min_width=12)
         for row in ("alone", *rules):
-            name = f"kf-{row}"
-            many = figures[f"library/{name}@{runs}-runs/{quantity}"]
+            name = f"{filter_row}-{row}"
+            many_name = f"{name},{runs}-runs" if "@" in name else f"{name}@{runs}-runs"
+            single = [figures.get(f"{path}/{name}/{quantity}") for path in ("ros", "library")]
+            many = figures.get(f"library/{many_name}/{quantity}")
+            if single[0] is None:
+                continue
             table.add_row(
                 "sensor 1 alone" if row == "alone" else row,
-                f"{figures[f'ros/{name}/{quantity}']['value']:.4f}",
-                f"{figures[f'library/{name}/{quantity}']['value']:.4f}",
-                f"{many['value']:.2f} ± {many['standard_error']:.2f}",
-                "" if many["published"] is None else f"{many['published']:.2f}",
-                many["verdict"],
+                *("" if f is None else f"{f['value']:.4f}" for f in single),
+                "" if many is None else f"{many['value']:.2f} ± {many['standard_error']:.2f}",
+                "" if many is None or many["published"] is None else f"{many['published']:.2f}",
+                "" if many is None else many["verdict"],
             )
-        tables.append(table)
+        if table.row_count:
+            tables.append(table)
     return tables

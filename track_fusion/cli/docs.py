@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,6 +14,7 @@ import click
 from track_fusion.params import Params, specs
 
 if TYPE_CHECKING:
+    from track_fusion.models.choices import Choice
     from track_fusion.scenarios import Scenario
 
 SOURCE_TREE = Path(__file__).parents[2]
@@ -26,6 +27,12 @@ class Section(NamedTuple):
     params: type[Params]
     prefix: str = ""
     title: str = ""  # in place of the first line of the dataclass's docstring
+    declared: bool = True  # false: only when another choice is made; its lines are comments
+
+    @property
+    def heading(self) -> str:
+        """The title, or the first line of the dataclass's docstring."""
+        return self.title or (self.params.__doc__ or "").strip().splitlines()[0]
 
 
 @click.command(short_help="Write the generated documents and parameter files.")
@@ -174,31 +181,54 @@ def _table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 def fusion_centre_sections() -> list[Section]:
     """List what the fusion centre declares; a test compares it with the node."""
     from track_fusion.fusion_centre import FusionCentreParams
-    from track_fusion.models.motion import MotionParams
+    from track_fusion.models.choices import MOTIONS, MotionChoice
     from track_fusion.nodes.frames import FrameParams
     from track_fusion.nodes.fusion_centre import SourceParams
     from track_fusion.nodes.managed import ManagedParams
+    from track_fusion.random_streams import RandomParams
     from track_fusion.rules import RULES
     from track_fusion.scan_buffer import ScanBufferParams
     from track_fusion.track_manager import TrackManagerParams
 
     used = "read when state_fusion is"
     return [
-        *map(Section, (FrameParams, SourceParams, MotionParams, FusionCentreParams)),
+        *map(Section, (FrameParams, SourceParams, MotionChoice)),
+        *_alternatives("motion", MOTIONS, MotionChoice().motion),
+        Section(FusionCentreParams),
         *(Section(r.params, f"{key}.", f"{r.title}: {used} {key}.") for key, r in RULES.items() if specs(r.params)),
-        *map(Section, (ScanBufferParams, TrackManagerParams, ManagedParams)),
+        *map(Section, (ScanBufferParams, TrackManagerParams)),
+        Section(RandomParams, title="Random numbers of rules that draw samples: seed, run and role name a stream."),
+        Section(ManagedParams),
     ]
 
 
 def sensor_tracker_sections() -> list[Section]:
     """List what a sensor tracker declares; a test compares it with the node."""
-    from track_fusion.models.motion import MotionParams
+    from track_fusion.models.choices import MOTIONS, SENSORS, Choice
     from track_fusion.nodes.frames import FrameParams
     from track_fusion.nodes.managed import ManagedParams
     from track_fusion.nodes.sensor_tracker import FeedbackParams
-    from track_fusion.sensor_tracker import SensorTrackerParams
+    from track_fusion.pda_tracker import PdaTracker, PdaTrackerParams
+    from track_fusion.sensor_tracker import MULTI_TARGET, SensorTrackerParams, TrackerChoice
+    from track_fusion.track_filters import TRACK_FILTERS
 
-    return [*map(Section, (FrameParams, MotionParams, SensorTrackerParams, FeedbackParams, ManagedParams))]
+    default = TrackerChoice()
+    filters: dict[str, Choice[Any]] = {**TRACK_FILTERS, MULTI_TARGET: Choice(PdaTrackerParams, PdaTracker)}
+    return [
+        *map(Section, (FrameParams, TrackerChoice)),
+        *_alternatives("motion", MOTIONS, default.motion),
+        *_alternatives("sensor", SENSORS, default.sensor),
+        *_alternatives("filter", filters, default.filter),
+        *map(Section, (SensorTrackerParams, FeedbackParams, ManagedParams)),
+    ]
+
+
+def _alternatives(name: str, table: Mapping[str, Choice[Any]], default: str) -> Iterator[Section]:
+    """Describe the parameters of each entry of a table of choices; a node declares those of one."""
+    for key, choice in table.items():
+        if specs(choice.params):
+            title = f"{Section(choice.params).heading} Declared when {name} is {key}."
+            yield Section(choice.params, title=title, declared=key == default)
 
 
 def parameter_file(node: str, sections: Iterable[Section]) -> str:
@@ -214,14 +244,14 @@ def parameter_file(node: str, sections: Iterable[Section]) -> str:
     lines += ["    # take the time from /clock, as a simulation or a replayed bag needs it (true or false)"]
     lines += ["    use_sim_time: false"]
     for section in sections:
-        title = section.title or (section.params.__doc__ or "").strip().splitlines()[0]
-        lines += ["", *_comment([f"--- {title}"], "    ")]
+        lines += ["", *_comment([f"--- {section.heading}"], "    ")]
         for name, (spec, default) in specs(section.params).items():
             unit = f" {spec.unit}" if spec.unit else ""
             lines += _comment([f"{spec.doc} ({spec.wanted()}{',' + unit if unit else ''})"], "    ")
             # ROS has no list without entries: it stays unset.
-            lines.append(f"    {section.prefix}{name}: {yaml_value(default)}" if default != () else
-                         f"    # {section.prefix}{name}: unset")  # fmt: skip
+            value = yaml_value(default) if default != () else "unset"
+            mark = "" if section.declared and default != () else "# "
+            lines.append(f"    {mark}{section.prefix}{name}: {value}")
     return "\n".join(lines) + "\n"
 
 

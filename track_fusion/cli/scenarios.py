@@ -15,11 +15,13 @@ def scenarios(as_json: bool) -> None:
     Example: track-fusion scenarios --json
     """
     from track_fusion.cli.output import console, grid, print_json
+    from track_fusion.nodes.bringup import bringups
     from track_fusion.scenarios import SCENARIOS
 
     names = ("key", "title", "paper", "shows", "default_runs", "published_runs", "assumptions")
+    runs_over_ros = bringups()
     listed = [
-        {**{name: getattr(s, name) for name in names}, "over_ros": s.tracking is not None} for s in SCENARIOS.values()
+        {**{name: getattr(s, name) for name in names}, "over_ros": s.key in runs_over_ros} for s in SCENARIOS.values()
     ]
     if as_json:
         print_json(listed, indent=2)

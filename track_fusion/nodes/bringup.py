@@ -14,6 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
+from track_fusion.params import unknown_name_error
+
 #: From SIGINT to the end of a node; they take a fraction of a second.
 STOP_DEADLINE_S = 10.0
 _PR_SET_PDEATHSIG = 1
@@ -108,9 +110,74 @@ def running(environment: Mapping[str, str], log_path: Path) -> Iterator[Nodes]:
             nodes.stop()
 
 
+#: Nodes of a scenario that are no trackers.
+OTHERS = ("replay", "fusion_centre", "evaluator")
+
+
+class Bringup:
+    """What a parameter file config/<name>.yaml describes: replay, trackers, fusion centre and evaluator of a scenario.
+
+    Parameters
+    ----------
+    name : str    of the file: a scenario's key, or key and filter, as li2022-nonlinear-sir
+
+    Raises
+    ------
+    ParameterError    there is none; the message lists those there are
+
+    Attributes
+    ----------
+    path : Path
+    scenario : str              key of the scenario
+    trackers : tuple of str     names of the tracker nodes, those of the scenario's sensors
+    filter : str                of the trackers
+    """
+
+    def __init__(self, name: str) -> None:
+        import yaml  # type: ignore[import-untyped]  # comes with rclpy
+
+        known = bringups()
+        if name not in known:
+            raise unknown_name_error(name, known, "parameter file of a scenario")
+        self.path = share_file("config", f"{name}.yaml")
+        content = yaml.safe_load(self.path.read_text())
+        self._sections = {node: section["ros__parameters"] for node, section in content.items()}
+        self.scenario = str(self._sections["replay"]["scenario"])
+        self.trackers = tuple(node for node in self._sections if node not in OTHERS)
+        self.filter = str(self._sections[self.trackers[0]].get("filter", "kalman"))
+
+    def on_top(self, name: str, rule: str | None, random: Mapping[str, Any]) -> dict[str, Any]:
+        """Parameters of a node on top of the file: the rule (None: none), and seed and run for all who draw."""
+        from track_fusion.scenarios import get_scenario
+
+        draws = name in ("replay", "fusion_centre") or self._sections[name].get("filter") == "particle"
+        given = dict(random) if draws else {}
+        if name == "replay":
+            given["sensors"] = list(self.trackers_of(rule))
+        elif name == "fusion_centre":
+            given["state_fusion"] = rule
+        elif name == "evaluator":
+            tracking = get_scenario(self.scenario).tracking
+            assert tracking is not None
+            given["steps"] = tracking.steps
+        elif rule is None:
+            given["feedback"] = "none"
+        return given
+
+    def trackers_of(self, rule: str | None) -> tuple[str, ...]:
+        """Names of the trackers that run: all, or without fusion the first."""
+        return self.trackers if rule else self.trackers[:1]
+
+
+def bringups() -> list[str]:
+    """Names of the parameter files that describe a scenario."""
+    folder = share_file("config")
+    return sorted(path.stem for path in folder.glob("*.yaml") if path.read_text().count("\nreplay:"))
+
+
 def start_scenario(
     nodes: Nodes,
-    scenario: str,
+    name: str,
     rule: str | None,
     overrides: Mapping[str, Mapping[str, Any]],
     evaluator: bool = True,
@@ -120,28 +187,24 @@ def start_scenario(
     Parameters
     ----------
     nodes : Nodes
-    scenario : str                           its parameter file is config/<scenario>.yaml
+    name : str                               of the parameter file, config/<name>.yaml
     rule : str or None                       fusion rule; None = no fusion: the first sensor's tracker alone
-    overrides : {node: {parameter: value}}   on top of the file
+    overrides : {node: {parameter: value}}   on top of the file; seed and run of the replay go to all who draw
     evaluator : bool                         whether to start that one, too
     """
-    from track_fusion.scenarios import get_scenario
-
-    tracking = get_scenario(scenario).tracking
-    assert tracking is not None
-    config = share_file("config", f"{scenario}.yaml")
-    sensors = list(tracking.sensors) if rule else list(tracking.sensors)[:1]
+    bringup = Bringup(name)
+    sensors = bringup.trackers_of(rule)
     fused = "/fusion_centre/tracks" if rule else f"/{sensors[0]}/tracks"
+    random = {key: value for key, value in overrides.get("replay", {}).items() if key in ("seed", "run")}
 
-    def start(executable: str, name: str, params: Mapping[str, Any], remaps: Mapping[str, str]) -> None:
-        nodes.start(executable, name, ros_arguments(name, config, {**params, **overrides.get(name, {})}, remaps))
+    def start(executable: str, node: str, remaps: Mapping[str, str]) -> None:
+        params = bringup.on_top(node, rule, random) | dict(overrides.get(node, {}))
+        nodes.start(executable, node, ros_arguments(node, bringup.path, params, remaps))
 
     for sensor in sensors:
-        params = {} if rule else {"feedback": "none"}
-        start("sensor_tracker", sensor, params, {"~/detections": f"/replay/{sensor}/detections", "~/feedback": fused})
+        start("sensor_tracker", sensor, {"~/detections": f"/replay/{sensor}/detections", "~/feedback": fused})
     if rule:
-        sources = {f"~/sources/{s}/tracks": f"/{s}/tracks" for s in sensors}
-        start("fusion_centre", "fusion_centre", {"state_fusion": rule}, sources)
+        start("fusion_centre", "fusion_centre", {f"~/sources/{s}/tracks": f"/{s}/tracks" for s in sensors})
     if evaluator:
-        start("evaluator", "evaluator", {"steps": tracking.steps}, {"~/truth": "/replay/truth", "~/tracks": fused})
-    start("replay", "replay", {"sensors": sensors}, {"~/fused": fused})
+        start("evaluator", "evaluator", {"~/truth": "/replay/truth", "~/tracks": fused})
+    start("replay", "replay", {"~/fused": fused})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 import shutil
 import time
@@ -19,19 +20,26 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock as ClockMessage
 
+from msg_adapters.arrays import merged
 from msg_adapters.odometry import odometry_from_msg
 from msg_adapters.track_table import track_table_from_msg
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.nodes.bringup import Nodes, local_environment, running, start_scenario
+from track_fusion.nodes.bringup import Bringup, Nodes, bringups, local_environment, running, start_scenario
 from track_fusion.nodes.managed import Fault, qos
 from track_fusion.nodes.recorder import Recorder, read_bag
+from track_fusion.params import ParameterError, specs, unknown_name_error
 from track_fusion.report.picture import Line, draw
-from track_fusion.scenarios import Scenario, get_scenario, judged_figures
+from track_fusion.rules import get_rule
+from track_fusion.scenarios import SCENARIOS, RuleChoice, Scenario, Tracking, get_scenario, judged_figures
 
-#: What the tracker nodes run: the rows of a scenario that start with this.
-NODE_FILTER = "kf-"
+#: How a scenario's rows name what the tracker nodes run.
+ROWS = {"kalman": "kf", "extended": "ekf", "unscented": "ukf", "cubature": "ckf", "particle": "sir", "student_t": "stf"}
+#: Rules that a scenario which has them all is shown with; the last is recorded and drawn.
+RULES = ("naive", "covariance_intersection", "arithmetic_average")
 #: A run over ROS that takes longer than this has hung.
-RUN_DEADLINE_S = 60.0
+RUN_DEADLINE_S = 120.0
+#: Library runs to compare with where they cost little.
+FAST_RUNS = 1000
 #: Domains that Linux's default range of ephemeral ports leaves free.
 DOMAINS = 101
 TRUTH = "/replay/truth"
@@ -48,18 +56,33 @@ class Demo:
 
     Attributes
     ----------
-    scenario : Scenario          one that runs over ROS
-    rules : tuple of str         fusion rules besides the unfused first sensor; the last is recorded and drawn
+    name : str                   of the parameter file
+    scenario : Scenario          the one of that file
+    row : str                    beginning of its rows, as the scenario names the trackers' filter: kf
+    rules : tuple of str         fusion rules, `key` or `key@variant`, besides the unfused first sensor; the last is
+                                 recorded and drawn
     out : Path                   results; an earlier result there is replaced
     seed : int                   of the random streams, run 0
     library_runs : int           Monte Carlo runs of the library for comparison
     """
 
+    name: str
     scenario: Scenario
+    row: str
     rules: tuple[str, ...]
     out: Path
     seed: int = 0
     library_runs: int = 1000
+
+    @property
+    def tracking(self) -> Tracking:
+        """What the nodes run."""
+        assert self.scenario.tracking is not None
+        return self.scenario.tracking
+
+    def choice(self, rule: str) -> RuleChoice | None:
+        """The scenario's own choice of parameters under this name."""
+        return next((c for c in self.scenario.rules if c.name == rule), None)
 
 
 def run_demo(demo: Demo, progress: Progress) -> dict[str, Any]:
@@ -80,14 +103,30 @@ def run_demo(demo: Demo, progress: Progress) -> dict[str, Any]:
     over_ros: dict[str, dict[str, float]] = {}
     for rule in (None, *demo.rules):
         over_ros[rule or "alone"] = _over_ros(demo, rule, progress)
-    scenario = demo.scenario
-    label = f"library, {demo.library_runs} runs"
-    same = scenario.study(1, demo.seed, lambda share: None, NODE_FILTER)
-    many = scenario.study(demo.library_runs, demo.seed, lambda share: progress(label, share), NODE_FILTER)
+    rows = [f"{demo.row}-{name}" for name in over_ros]
+    same, label = _library(demo, rows, 1, lambda share: None), f"library, {demo.library_runs} runs"
+    many = _library(demo, rows, demo.library_runs, lambda share: progress(label, share))
     result = _figures(demo, over_ros, same, many)
     (demo.out / "figures.json").write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
     _picture(demo)
     return result
+
+
+def _library(demo: Demo, rows: list[str], runs: int, progress: Callable[[float], None]) -> dict[str, Estimate]:
+    """Measure the rows that the scenario has; it may know nothing of a rule that the user has asked for."""
+    found: dict[str, Estimate] = {}
+    for done, row in enumerate(rows):
+
+        def part(share: float, done: int = done) -> None:
+            progress((done + share) / len(rows))
+
+        try:
+            measured = demo.scenario.study(runs, demo.seed, part, row)
+        except ParameterError:
+            continue
+        found |= {name: estimate for name, estimate in measured.items() if name.startswith(f"{row}/")}
+    progress(1.0)
+    return found
 
 
 def _over_ros(demo: Demo, rule: str | None, progress: Progress) -> dict[str, float]:
@@ -98,13 +137,14 @@ def _over_ros(demo: Demo, rule: str | None, progress: Progress) -> dict[str, flo
     domain = (os.getpid() + len(name)) % DOMAINS
     recording = rule == demo.rules[-1]
     with running(local_environment(domain), log) as nodes, _observer(domain) as (node, spin):
-        sensors = list(demo.scenario.tracking.sensors) if demo.scenario.tracking else []
+        sensors = list(demo.tracking.sensors)
         topics = {TRUTH: ODOMETRY, **{f"/{s}/tracks": TABLE for s in sensors}, FUSED: TABLE}
         topics |= {f"/replay/{s}/detections": TABLE for s in sensors}
         recorder = Recorder(node, demo.out / "bag", topics) if recording else None
         seen = _clock_counter(node)
-        start_scenario(nodes, demo.scenario.key, rule, _overrides(demo, rule, sensors, judged, recording))
-        steps = demo.scenario.tracking.steps if demo.scenario.tracking else 1
+        key = rule and rule.partition("@")[0]
+        start_scenario(nodes, demo.name, key, _overrides(demo, rule, sensors, judged, recording))
+        steps = demo.tracking.steps
         _wait(nodes, log, spin, lambda: progress(f"ROS, {name}", seen() / steps))
         if recorder is not None:
             deadline = time.monotonic() + 5.0
@@ -132,8 +172,18 @@ def _overrides(
         overrides[sensors[0]] = {"expected_subscribers": 2}  # replay and evaluator
         return overrides
     overrides |= {s: {"expected_subscribers": 1 + extra} for s in sensors}
-    overrides["fusion_centre"] = {"expected_subscribers": 2 + len(sensors) + extra}
+    overrides["fusion_centre"] = {"expected_subscribers": 2 + len(sensors) + extra} | _variant(demo, rule)
     return overrides
+
+
+def _variant(demo: Demo, rule: str) -> dict[str, Any]:
+    """Parameters in which a variant differs from the defaults; those of the scenario's own rules are in its file."""
+    choice = demo.choice(rule)
+    if choice is None or not choice.variant:
+        return {}
+    values = {name: (getattr(choice.params, name), default) for name, (_, default) in specs(choice.params).items()}
+    given = {f"{choice.key}.{name}": value for name, (value, default) in values.items() if value != default}
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in given.items()}
 
 
 @contextmanager
@@ -184,14 +234,15 @@ def _figures(
 
     The standard error of one run is the spread of a run in the study.
     """
-    scenario, rows = demo.scenario, [NODE_FILTER + name for name in over_ros]
+    scenario = demo.scenario
     listed: list[dict[str, Any]] = []
-    for row, measured in zip(rows, over_ros.values(), strict=True):
+    for rule, measured in over_ros.items():
         for quantity in measured:
-            name = f"{row}/{quantity}"
-            for path, value in (("ros", measured[quantity]), ("library", same[name].value)):
-                single = Estimate(value, many[name].spread(1), 1)
-                (figure,) = judged_figures(scenario, {name: single})
+            name = f"{demo.row}-{rule}/{quantity}"
+            spread = many[name].spread(1) if name in many else math.nan
+            single = {"ros": measured[quantity]} | ({"library": same[name].value} if name in same else {})
+            for path, value in single.items():
+                (figure,) = judged_figures(scenario, {name: Estimate(value, spread, 1)})
                 listed.append({**figure, "name": f"{path}/{name}"})
     for figure in judged_figures(scenario, many):
         name = figure["name"]
@@ -200,6 +251,7 @@ def _figures(
         listed.append({**figure, "name": f"library/{variant}/{quantity}"})
     return {
         "scenario": scenario.key,
+        "parameter_file": demo.name,
         "runs": 1,
         "seed": demo.seed,
         "library_runs": demo.library_runs,
@@ -209,32 +261,45 @@ def _figures(
 
 def _picture(demo: Demo) -> None:
     """Draw what the bag holds."""
-    tracking = demo.scenario.tracking
-    assert tracking is not None
-    axes, sensors = tracking.motion.layout.axes, list(tracking.sensors)
+    layout, sensors = demo.tracking.motion.layout, list(demo.tracking.sensors)
+    axes, at = layout.axes, list(layout.position)
     topics = {**{s: f"/{s}/tracks" for s in sensors}, "fused": FUSED}
     messages = read_bag(demo.out / "bag", (TRUTH, *topics.values()))
-    states = np.array([odometry_from_msg(m, axes).tracks.mean[0, 0] for m in messages[TRUTH]])
+    states = np.array([odometry_from_msg(m, axes).tracks.mean[0, 0, at] for m in messages[TRUTH]])
     lines = []
     for name, topic in topics.items():
-        tables = [track_table_from_msg(m) for m in messages[topic]]
-        mean, cov = np.array([t.mean[0, 0, :2] for t in tables]), np.array([t.cov[0, 0, :2, :2] for t in tables])
+        moments = [merged(track_table_from_msg(m), axes) for m in messages[topic]]
+        mean = np.array([m[0, at] for m, _ in moments])
+        cov = np.array([c[0][np.ix_(at, at)] for _, c in moments])
         label = f"fused: {demo.rules[-1].replace('_', ' ')}" if name == "fused" else name.replace("_", " ")
         lines.append(Line(label, COLORS.get(name, "tab:green"), mean, cov))
-    title = f"{demo.scenario.title}: fused over ROS 2 and fed back to both trackers (one run)"
-    draw(demo.out / "tracks.png", title, Line("truth", COLORS["truth"], states[:, :2]), lines)
+    title = f"{demo.scenario.title}: fused over ROS 2 and fed back to the trackers (one run)"
+    draw(demo.out / "tracks.png", title, Line("truth", COLORS["truth"], states), lines)
 
 
-def demo_of(key: str, out: Path, seed: int, library_runs: int, rules: tuple[str, ...] = ()) -> Demo:
-    """Make the demonstration of a scenario; its rules are the scenario's own unless given.
+def demo_of(name: str, out: Path, seed: int, library_runs: int | None, rules: tuple[str, ...] = ()) -> Demo:
+    """Make the demonstration of a scenario; its rules are RULES, or the scenario's own, unless given.
+
+    Parameters
+    ----------
+    name : str                    of a parameter file: a scenario's key, or key and filter
+    library_runs : int or None    None: 1000 where the trackers are Kalman filters, which cost little, else what the
+                                  scenario does by default
 
     Raises
     ------
-    ParameterError    no such scenario
+    ParameterError    no such parameter file, or no such rule or variant
     Fault             the scenario does not run over ROS
     """
-    scenario = get_scenario(key)
-    if scenario.tracking is None:
-        raise Fault(f"The scenario {key} runs in the library only: track-fusion reproduce {key}.")
-    paper = tuple(dict.fromkeys(c.key for c in scenario.rules if not c.variant))
-    return Demo(scenario, rules or paper, out, seed, library_runs)
+    if name in SCENARIOS and name not in bringups():
+        raise Fault(f"The scenario {name} runs in the library only: track-fusion reproduce {name}.")
+    bringup = Bringup(name)
+    scenario, row = get_scenario(bringup.scenario), ROWS[bringup.filter]
+    known = [c.name for c in scenario.rules]
+    own = RULES if set(RULES) <= set(known) else tuple(c.name for c in scenario.rules if not c.variant)
+    for rule in rules:
+        if "@" in rule and rule not in known:
+            raise unknown_name_error(rule, known, "rule of this scenario")
+        get_rule(rule.partition("@")[0])
+    runs = library_runs or (FAST_RUNS if row == "kf" else scenario.default_runs)
+    return Demo(name, scenario, row, rules or own, out, seed, runs)

@@ -192,6 +192,7 @@ SCENARIO = Scenario(
     charts=STUDY.charts,
     claims=_claims(),
     piece=50,
+    tracking=TRACKING,
     rules=RULE_CHOICES,
     compare=STUDY.compare,
 )
