@@ -1,0 +1,171 @@
+"""Every parameter file of a scenario over real processes: each step and each figure of a run is the library's.
+
+The fused posterior goes back to the trackers, which start the next step from it: from the second step on every number
+depends on the feedback.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from nodes.support import START_S, STEP_S, read, stamp_ns
+from numpy.typing import NDArray
+from ros_helpers import Probe
+from sensor_msgs.msg import PointCloud2
+
+from msg_adapters.arrays import merged
+from track_fusion.filters import extended
+from track_fusion.nodes.bringup import Bringup, bringups, local_environment, running, start_scenario
+from track_fusion.random_streams import stream
+from track_fusion.rules import RULES, SourceTracks, get_rule
+from track_fusion.scenarios import RuleChoice, get_scenario, li2022_linear, li2022_nonlinear
+from track_fusion.scenarios.one_target import (
+    GaussianFilter,
+    Row,
+    Sample,
+    Sir,
+    drawn,
+    gaussian_alone,
+    gaussian_fused,
+    sir_alone,
+    sir_fused,
+    start,
+)
+
+SEED, RUN = 5, 2
+RUN_S = 300.0  # a run takes 5 s on two idle cores; tests of others may be running
+TOLERANCE = 1e-9
+KF = GaussianFilter(extended.predict, extended.update)
+
+
+class Case(NamedTuple):
+    """A run over ROS: parameter file, rule (None: the first sensor alone), beginning of the scenario's row."""
+
+    name: str
+    rule: str | None
+    row: str
+    library: Row
+    parameters: dict[str, Any] = {}
+
+    def __str__(self) -> str:
+        return f"{self.name}:{self.rule or 'alone'}"
+
+
+def choice(name: str, rule: str) -> RuleChoice:
+    return next(c for c in get_scenario(name).rules if c.name == rule)
+
+
+def sampled() -> Row:
+    """Kalman filters fused by a rule that draws samples, at its defaults; one stream from step to step."""
+    tracking, rule = li2022_linear.TRACKING, RULES["geometric_mean_sampling"]
+
+    def estimates(sample: Sample) -> Iterator[NDArray[np.float64]]:
+        rng, (mean, cov) = stream(SEED, RUN, "fusion_centre"), start(tracking, 1)
+        for k in range(tracking.steps):
+            mean, cov = KF.predict(mean, cov, tracking.motion.over(tracking.dt_s))
+            pairs = zip(sample.seen, tracking.sensors.values(), strict=True)
+            local = [KF.update(mean, cov, z[:, k], sensor)[:2] for z, sensor in pairs]
+            means, covs = (np.stack(parts, 1) for parts in zip(*local, strict=True))
+            fused = rule.fuse(SourceTracks(means, covs, extras={"seed": rng}), rule.params())
+            mean, cov = fused.mean, fused.cov
+            yield mean
+
+    return Row(estimates)
+
+
+def li2022() -> Iterator[Case]:
+    linear, nonlinear, ckf = li2022_linear.TRACKING, li2022_nonlinear.TRACKING, li2022_nonlinear.CKF
+    average, uniform = "arithmetic_average", {"covariance_intersection.criterion": "uniform"}
+    yield Case("li2022-linear", "geometric_mean_sampling", "", sampled())
+    yield Case("li2022-linear-sir", average, "sir-arithmetic_average",
+               sir_fused(linear, li2022_linear.SIR, choice("li2022-linear", average), union=True))  # fmt: skip
+    for rule in ("naive", average):
+        row = gaussian_fused(nonlinear, ckf, choice("li2022-nonlinear", rule))
+        yield Case("li2022-nonlinear", rule, f"ckf-{rule}", row)
+    ci = choice("li2022-nonlinear", "covariance_intersection@uniform")
+    yield Case("li2022-nonlinear", ci.key, f"ckf-{ci.name}", gaussian_fused(nonlinear, ckf, ci), uniform)
+    yield Case("li2022-nonlinear", None, "ckf-alone", gaussian_alone(nonlinear, ckf, 1))
+    sir: Sir = li2022_nonlinear.SIR
+    joined = sir_fused(nonlinear, sir, choice("li2022-nonlinear", average), union=True)
+    yield Case("li2022-nonlinear-sir", average, "sir-arithmetic_average", joined)
+    yield Case("li2022-nonlinear-sir", ci.key, f"sir-{ci.name}", sir_fused(nonlinear, sir, ci), uniform)
+    yield Case("li2022-nonlinear-sir", None, "sir-alone", sir_alone(nonlinear, sir, 1))
+
+
+CASES = [*li2022()]
+
+
+def test_every_parameter_file_is_run() -> None:
+    tested_elsewhere = {"li2022-linear"}  # test_lockstep.py
+    assert {c.name for c in CASES} | tested_elsewhere == set(bringups())
+
+
+def run(case: Case, context: Any, domain: int, folder: Path) -> tuple[list[PointCloud2], dict[str, Any]]:
+    """Run all steps of a scenario; return the fused tables and what the evaluator says."""
+    log, judged = folder / "nodes.log", folder / "judged.json"
+    bringup, fused = Bringup(case.name), "/fusion_centre/tracks" if case.rule else "/sensor_1/tracks"
+    trackers = bringup.trackers_of(case.rule)
+    patient = {"subscribers_deadline_s": START_S}
+    overrides: dict[str, dict[str, Any]] = {name: {**patient, "feedback_timeout_s": RUN_S} for name in trackers}
+    overrides["fusion_centre"] = {**patient, **case.parameters}
+    overrides["replay"] = {"seed": SEED, "run": RUN, "deadline_s": START_S}
+    overrides["evaluator"] = {"output": str(judged)}
+    publisher = "fusion_centre" if case.rule else trackers[0]
+    overrides[publisher]["expected_subscribers"] = 3 + (len(trackers) if case.rule else 0)  # replay, evaluator, test
+    messages: list[PointCloud2] = []
+    tracking = get_scenario(bringup.scenario).tracking
+    assert tracking is not None
+    with Probe(context) as probe, running(local_environment(domain), log) as nodes:
+        messages = probe.listen(fused, PointCloud2, 1000)
+        start_scenario(nodes, case.name, case.rule, overrides)
+
+        def done() -> bool:
+            assert nodes.failed() is None, f"{nodes.failed()} failed: {log.read_text()}"
+            return len(messages) >= tracking.steps
+
+        probe.wait_for(done, RUN_S, "all steps")
+        for name in ("replay", "evaluator"):
+            assert nodes.processes[name].wait(STEP_S) == 0, log.read_text()
+    return messages, json.loads(judged.read_text())
+
+
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_the_nodes_give_the_numbers_of_the_library(
+    case: Case, ros_context: Any, ros_domain: int, tmp_path: Path
+) -> None:
+    messages, judged = run(case, ros_context, ros_domain, tmp_path)
+    scenario = get_scenario(Bringup(case.name).scenario)
+    tracking = scenario.tracking
+    assert tracking is not None
+    step_ns, axes = round(tracking.dt_s * 1e9), tracking.motion.layout.axes
+    assert [stamp_ns(m) for m in messages] == [k * step_ns for k in range(1, tracking.steps + 1)]
+    truth, sample = drawn(tracking, [RUN], SEED)
+    expected = np.array([mean[0] for mean in case.library.estimates(sample)])
+    found = np.array([merged(read(m), axes)[0][0] for m in messages])
+    scale = np.abs(expected).max(0)
+    np.testing.assert_allclose(found / scale, expected / scale, rtol=0, atol=TOLERANCE)
+    assert (judged["times"], judged["missed"], judged["false"]) == (tracking.steps, 0, 0)
+    compare_figures(case, judged["all"], found - truth[0, 1:])
+
+
+def compare_figures(case: Case, judged: dict[str, Any], error: NDArray[np.float64]) -> None:
+    """Compare what the evaluator says with the figures of the scenario's own row, of this run alone."""
+    scenario = get_scenario(Bringup(case.name).scenario)
+    assert scenario.tracking is not None
+    position = list(scenario.tracking.motion.layout.position)
+    norm = np.linalg.norm(error[:, position], axis=1).mean()
+    assert judged["position_armse_m"] == pytest.approx(norm, rel=TOLERANCE)
+    if not case.row:
+        assert get_rule(case.rule or "").optional == ("seed",)
+        return
+    samples = scenario.sample([RUN], SEED, lambda share: None, case.row)
+    own = {name.rpartition("/")[2]: e.value for name, e in scenario.figures(samples).items()
+           if name.startswith(f"{case.row}/") and "_armse_" in name}  # fmt: skip
+    assert own
+    for quantity, value in own.items():
+        assert judged[quantity] == pytest.approx(value, rel=TOLERANCE), quantity
