@@ -94,7 +94,7 @@ def test_every_parameter_is_there_at_its_default(node: str) -> None:
         for name, (spec, default) in specs(section.params).items():
             full = section.prefix + name
             if default == () or not section.declared:
-                assert f"    # {full}: {yaml_value(default) if default else 'unset'}\n" in text
+                assert f"    # {full}: {'unset' if default == () else yaml_value(default)}\n" in text
                 continue
             got = values.pop(full)
             assert got == (list(default) if isinstance(default, tuple) else default)

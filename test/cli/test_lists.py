@@ -64,6 +64,7 @@ def test_scenarios_as_json() -> None:
     first = listed[0]
     assert first["key"] == "li2022-linear"
     assert first["over_ros"] is True
+    assert first["demos"] == ["li2022-linear", "li2022-linear-sir"]
     assert first["default_runs"] == SCENARIOS["li2022-linear"].default_runs
     assert {"title", "paper", "shows", "assumptions", "published_runs"} <= set(first)
 

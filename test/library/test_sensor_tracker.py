@@ -3,12 +3,16 @@
 import numpy as np
 import pytest
 
+from track_fusion.filters import cubature, extended, particle, student_t, unscented
 from track_fusion.filters.kalman import predict, update
-from track_fusion.models.measurement import LinearSensor
+from track_fusion.models.choices import make
+from track_fusion.models.measurement import LinearSensor, RangeBearingSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
+from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
 from track_fusion.params import ParameterError, Params
+from track_fusion.random_streams import stream
 from track_fusion.sensor_tracker import SensorTracker, SensorTrackerParams
-from track_fusion.track_filters import TRACK_FILTERS
+from track_fusion.track_filters import TRACK_FILTERS, SirParams, StudentTParams
 from track_fusion.tracks import COASTED, CONFIRMED, StateLayout, TrackBatch, planar_layout
 
 SECOND = 10**9
@@ -165,3 +169,155 @@ def test_time_does_not_go_back():
     own.step(SECOND, NOTHING, None)
     with pytest.raises(ValueError, match="must be >= 0 s"):
         own.step(0, NOTHING, None)
+
+
+# ---- the choice of filter ----------------------------------------------------------------------------------------
+
+STATE = np.array([100.0, 50.0, 3.0, -1.0])
+COV = np.diag([25.0, 16.0, 4.0, 4.0])
+RADAR = RangeBearingSensor(LAYOUT, 2.0, 0.01, (10.0, -20.0))
+
+
+def radar_tracker(key, params=None, sensor=RADAR, motion=MOTION, **initial):
+    initial = initial or {"initial_mean": tuple(STATE), "initial_cov": tuple(COV.ravel())}
+    entry = TRACK_FILTERS[key]
+    made = make(TRACK_FILTERS, key, params or entry.params(), motion, sensor)
+    return SensorTracker(motion, sensor, made, "map", SensorTrackerParams(**initial))
+
+
+@pytest.mark.parametrize("key", ["extended", "unscented", "cubature", "student_t"])
+def test_each_filter_is_the_one_of_its_name(key):
+    module = {"extended": extended, "unscented": unscented, "cubature": cubature, "student_t": student_t}[key]
+    mean, cov = module.predict(STATE, COV, MOTION.over(2.0))
+    z = RADAR.observe(STATE) + [1.5, 0.01]
+    if key == "student_t":
+        mean, cov, _, _ = student_t.update(mean, cov, 4.0, z, RADAR)
+        params = StudentTParams(dof=4.0)
+    else:
+        (mean, cov, _), params = module.update(mean, cov, z, RADAR), None
+    found = radar_tracker(key, params).step(2 * SECOND, z[None], None)
+    np.testing.assert_allclose(found.mean[0, 0], mean, rtol=1e-12)
+    np.testing.assert_allclose(found.cov[0, 0], cov, rtol=1e-12)
+    assert found.dof.tolist() == [4.0 if key == "student_t" else np.inf]
+
+
+@pytest.mark.parametrize("key", TRACK_FILTERS)
+def test_filters_agree_where_all_is_linear_and_nearly_gaussian(key):
+    """Many particles, many degrees of freedom: then every filter approaches Kalman's."""
+    params = {"particle": SirParams(particles=40_000), "student_t": StudentTParams(dof=1e6)}.get(key)
+    sensor = LinearSensor.position(LAYOUT, 3.0)
+    own = radar_tracker(key, params, sensor)
+    mean, cov = STATE, COV
+    for k, z in enumerate(np.array([[103.0, 49.0], [106.0, 47.0], [110.0, 47.0]]), start=1):
+        found = own.step(k * SECOND, z[None], None)
+        mean, cov = predict(mean, cov, *MOTION.matrices(1.0))
+        mean, cov, _ = update(mean, cov, z, sensor.matrix, sensor.noise)
+    (found_mean,), (found_cov,) = found.moments
+    close = {"particle": 0.05, "student_t": 1e-5}.get(key, 1e-9)
+    sd = np.sqrt(np.diag(cov))
+    np.testing.assert_allclose((found_mean - mean) / sd, 0.0, atol=close)
+    np.testing.assert_allclose((found_cov - cov) / np.outer(sd, sd), 0.0, atol=close)
+
+
+def test_a_detection_brings_its_own_noise():
+    z, noise = RADAR.observe(STATE) + [4.0, 0.0], np.diag([100.0, 1.0])
+    mean, cov, _ = extended.update(*extended.predict(STATE, COV, MOTION.over(1.0)), z, RangeBearingSensor(
+        LAYOUT, 10.0, 1.0, (10.0, -20.0)))  # fmt: skip
+    found = radar_tracker("extended").step(SECOND, z[None], noise[None])
+    np.testing.assert_allclose(found.mean[0, 0], mean, rtol=1e-12)
+    np.testing.assert_allclose(found.cov[0, 0], cov, rtol=1e-12)
+
+
+def test_a_radar_starts_a_track_from_a_detection_and_keeps_to_the_nearest():
+    own = radar_tracker("extended", initial_speed_sd=5.0)
+    z = RADAR.observe(STATE)
+    found = own.step(SECOND, z[None], None)
+    np.testing.assert_allclose(found.mean[0, 0], [100.0, 50.0, 0.0, 0.0], atol=1e-9)
+    across = found.cov[0, 0, :2, :2] @ [-70.0, 90.0] / np.hypot(70.0, 90.0)
+    np.testing.assert_allclose(across, 0.01**2 * np.hypot(70.0, 90.0) * np.array([-70.0, 90.0]), rtol=1e-9)
+    assert found.cov[0, 0, 2, 2] == 25.0
+    far = np.stack([z + [500.0, 0.0], z + [0.0, 0.02 - 2 * np.pi], z + [0.0, 1.0]])
+    again = own.step(2 * SECOND, far, None)
+    assert np.hypot(*(again.mean[0, 0, :2] - [100.0, 50.0])) < 10.0
+
+
+def test_a_sensor_of_velocities_needs_an_initial_state():
+    sensor = LinearSensor(("vx", "vy"), np.eye(4)[2:], np.eye(2))
+    with pytest.raises(ParameterError, match=r"parameter must be given: from detections of vx, vy alone"):
+        radar_tracker("kalman", sensor=sensor, initial_speed_sd=1.0)
+    found = radar_tracker("kalman", sensor=sensor).step(SECOND, np.array([[5.0, 5.0]]), None)
+    assert found.mean[0, 0, 2] > 4.0
+
+
+def test_a_turn_rate_starts_unknown():
+    layout = StateLayout(("x", "y", "vx", "vy", "turn_rate"))
+    motion = CoordinatedTurn(layout, CoordinatedTurnParams())
+    own = radar_tracker("cubature", None, RangeBearingSensor(layout, 1.0, 0.1), motion, initial_turn_rate_sd=0.2)
+    found = own.step(SECOND, np.array([[100.0, 0.5]]), None)
+    assert found.cov[0, 0, 4].tolist() == [0.0, 0.0, 0.0, 0.0, pytest.approx(0.04)]
+
+
+def test_kalman_needs_linear_models():
+    with pytest.raises(ParameterError, match="must be one for non-linear models, .* Got 'kalman'"):
+        radar_tracker("kalman")
+
+
+# ---- particles ---------------------------------------------------------------------------------------------------
+
+
+def cloud_of(track):
+    return particle.Particles(track.mean[0], np.log(track.weight[0]))
+
+
+def sir(**params):
+    return SirParams(**{"particles": 50, "seed": 3, "run": 2, "role": "sir a", **params})
+
+
+def test_particles_are_drawn_in_the_order_of_the_library():
+    """Initial draw; then at each step motion and, before the next, resampling."""
+    own, rng = radar_tracker("particle", sir()), stream(3, 2, "sir a")
+    cloud = particle.from_gaussian(STATE, COV, rng, 50)
+    for k in range(1, 4):
+        z = RADAR.observe(STATE) + [k, 0.0]
+        cloud, _ = particle.update(particle.predict(cloud, MOTION.over(1.0), rng), z, RADAR)
+        found = own.step(k * SECOND, z[None], None)
+        np.testing.assert_allclose(found.mean[0], cloud.points, rtol=1e-12)
+        np.testing.assert_allclose(found.weight[0], cloud.weight, rtol=1e-9, atol=1e-300)
+        cloud = particle.resample_systematic(cloud, rng)
+    assert not found.cov.any()
+
+
+def test_particles_are_drawn_again_from_what_is_fed_back():
+    z = RADAR.observe(STATE)[None]
+    for fused in (fused_at(SECOND, [1.0, 2.0, 3.0, 4.0], cov=4 * np.eye(4)), None):
+        own, rng = radar_tracker("particle", sir()), stream(3, 2, "sir a")
+        own_track = own.step(SECOND, z, None)
+        particle.predict(particle.from_gaussian(STATE, COV, rng, 50), MOTION.over(1.0), rng)
+        if fused is None:  # particles of two sources in one track
+            both = particle.union([cloud_of(own_track), cloud_of(own_track)], np.array([0.25, 0.75]))
+            fused = own_track.replace(mean=both.points[None], weight=both.weight[None], cov=np.zeros((1, 100, 4, 4)))
+            cloud = particle.resample_systematic(both, rng, 50)
+        else:
+            cloud = particle.from_gaussian(fused.mean[0, 0], fused.cov[0, 0], rng, 50)
+        assert own.feed_back(fused)
+        found = own.step(2 * SECOND, np.zeros((0, 2)), None)
+        np.testing.assert_allclose(found.mean[0], particle.predict(cloud, MOTION.over(1.0), rng).points, rtol=1e-12)
+
+
+def test_particles_begin_anew_with_the_tracker():
+    own = radar_tracker("particle", sir())
+    first = own.step(SECOND, RADAR.observe(STATE)[None], None)
+    own.reset()
+    again = own.step(SECOND, RADAR.observe(STATE)[None], None)
+    np.testing.assert_array_equal(first.mean, again.mean)
+    np.testing.assert_array_equal(first.weight, again.weight)
+
+
+def test_particles_without_weight_do_not_vanish():
+    """A surprise leaves one particle all the weight; a track of one row without covariance would be an error."""
+    own = radar_tracker("particle", sir())
+    found = own.step(SECOND, RADAR.observe(STATE)[None] + [2000.0, 0.0], None)
+    assert found.weight.max() > 1 - 1e-12
+    assert (found.weight > 0).all()
+    batch, rejected = TrackBatch.screened(**{k: v for k, v in vars(found).items() if k != "moments"})
+    assert (len(batch), +rejected) == (1, {})

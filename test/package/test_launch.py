@@ -10,9 +10,17 @@ import pytest
 import yaml
 from package import launch_stand_in
 
+from track_fusion.nodes.bringup import Bringup, bringups
+from track_fusion.scenarios import get_scenario
+
 ROOT = Path(__file__).resolve().parents[2]
 SCENARIO, DEMO = (ROOT / "launch" / f"{name}.launch.py" for name in ("scenario", "demo"))
-LAUNCHES = [(SCENARIO, {}), (SCENARIO, {"rule": "naive", "seed": "7", "pace": "realtime", "rate": "2"}), (DEMO, {})]
+FILES = sorted(bringups())
+LAUNCHES = [
+    *((SCENARIO, {"scenario": name}) for name in FILES),
+    (SCENARIO, {"rule": "naive", "seed": "7", "pace": "realtime", "rate": "2"}),
+    (DEMO, {}),
+]
 
 pytestmark = pytest.mark.colcon
 
@@ -22,7 +30,7 @@ def _temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
 
 
-@pytest.fixture(params=LAUNCHES, ids=lambda launch: f"{launch[0].name}:{len(launch[1])}")
+@pytest.fixture(params=LAUNCHES, ids=lambda launch: f"{launch[0].name}:{','.join(launch[1].values())}")
 def recorded(request: pytest.FixtureRequest) -> launch_stand_in.Recorded:
     path, arguments = request.param
     return launch_stand_in.load(path, ROOT, **arguments)
@@ -32,7 +40,7 @@ def overrides(path: Path, **arguments: str) -> dict[str, dict[str, Any]]:
     """Return what the files after the scenario's own say, by node."""
     found = {}
     for node in launch_stand_in.load(path, ROOT, **arguments).nodes:
-        assert node.parameter_files[0] == ROOT / "config" / "li2022-linear.yaml"
+        assert node.parameter_files[0] == ROOT / "config" / f"{arguments.get('scenario', 'li2022-linear')}.yaml"
         for file in node.parameter_files[1:]:
             found[node.name] = yaml.safe_load(file.read_text())[node.name]["ros__parameters"]
     return found
@@ -42,14 +50,16 @@ def test_every_launch_file_is_tested() -> None:
     assert {path for path, _ in LAUNCHES} == set(ROOT.glob("launch/*.launch.py"))
 
 
-def test_replay_two_trackers_centre_and_evaluator_are_started(recorded: launch_stand_in.Recorded) -> None:
-    assert {node.name: node.executable for node in recorded.nodes} == {
-        "sensor_1": "sensor_tracker",
-        "sensor_2": "sensor_tracker",
-        "fusion_centre": "fusion_centre",
-        "evaluator": "evaluator",
-        "replay": "replay",
-    }
+def test_replay_trackers_centre_and_evaluator_are_started(recorded: launch_stand_in.Recorded) -> None:
+    """As many trackers as the scenario has sensors; the nodes are those that `track-fusion demo` starts."""
+    (file,) = {node.parameter_files[0] for node in recorded.nodes}
+    bringup = Bringup(file.stem)
+    trackers = dict.fromkeys(bringup.trackers, "sensor_tracker")
+    others = {name: name for name in ("fusion_centre", "evaluator", "replay")}
+    assert {node.name: node.executable for node in recorded.nodes} == trackers | others
+    tracking = get_scenario(bringup.scenario).tracking
+    assert tracking is not None
+    assert tuple(tracking.sensors) == bringup.trackers
     assert [node.name for node in recorded.nodes if node.ends_launch] == ["replay"]
 
 
@@ -74,7 +84,7 @@ def test_every_argument_says_what_it_is(recorded: launch_stand_in.Recorded) -> N
 def test_topics_connect(recorded: launch_stand_in.Recorded) -> None:
     """What one node reads under another's name is what that other node publishes."""
     published = {"/replay/truth", "/fusion_centre/tracks"}
-    for sensor in ("sensor_1", "sensor_2"):
+    for sensor in (node.name for node in recorded.nodes if node.executable == "sensor_tracker"):
         published |= {f"/replay/{sensor}/detections", f"/{sensor}/tracks"}
     for node in recorded.nodes:
         assert set(node.remappings.values()) <= published
@@ -83,8 +93,16 @@ def test_topics_connect(recorded: launch_stand_in.Recorded) -> None:
 
 def test_arguments_reach_the_nodes_that_own_them_with_their_types() -> None:
     found = overrides(SCENARIO, rule="naive", seed="7", pace="realtime", rate="2")
-    assert found == {"fusion_centre": {"state_fusion": "naive"}, "replay": {"seed": 7, "pace": "realtime", "rate": 2.0}}
+    assert found == {
+        "fusion_centre": {"state_fusion": "naive", "seed": 7},
+        "replay": {"seed": 7, "pace": "realtime", "rate": 2.0},
+    }
     assert isinstance(found["replay"]["rate"], float)  # an integer would be refused: the parameter is a double
+
+
+def test_the_seed_reaches_all_who_draw() -> None:
+    found = overrides(SCENARIO, scenario="li2022-nonlinear-sir", seed="7")
+    assert found == {name: {"seed": 7} for name in ("replay", "fusion_centre", "sensor_1", "sensor_2")}
 
 
 def test_without_arguments_the_parameter_file_decides() -> None:

@@ -15,13 +15,14 @@ def scenarios(as_json: bool) -> None:
     Example: track-fusion scenarios --json
     """
     from track_fusion.cli.output import console, grid, print_json
-    from track_fusion.nodes.bringup import bringups
+    from track_fusion.nodes.bringup import demos_of
     from track_fusion.scenarios import SCENARIOS
 
     names = ("key", "title", "paper", "shows", "default_runs", "published_runs", "assumptions")
-    runs_over_ros = bringups()
+    demos = {key: demos_of(key) for key in SCENARIOS}
     listed = [
-        {**{name: getattr(s, name) for name in names}, "over_ros": s.key in runs_over_ros} for s in SCENARIOS.values()
+        {**{name: getattr(s, name) for name in names}, "over_ros": bool(demos[s.key]), "demos": demos[s.key]}
+        for s in SCENARIOS.values()
     ]
     if as_json:
         print_json(listed, indent=2)
@@ -31,6 +32,6 @@ def scenarios(as_json: bool) -> None:
     out = console()
     for s in listed:
         out.print(f"[bold]{s['key']}[/bold]  {escape(s['title'])}")
-        over_ros = f"yes: track-fusion demo {s['key']}" if s["over_ros"] else "no"
+        over_ros = ", ".join(f"track-fusion demo {name}" for name in s["demos"]) or "no"
         runs = f"{s['default_runs']} by default, {s['published_runs']} in the paper"
         out.print(grid([("Shows", s["shows"]), ("Paper", s["paper"]), ("Runs", runs), ("Over ROS", over_ros)]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -110,6 +111,7 @@ def running(environment: Mapping[str, str], log_path: Path) -> Iterator[Nodes]:
             nodes.stop()
 
 
+_SCENARIO = re.compile(r"^replay:\n  ros__parameters:\n    scenario: (\S+)$", re.MULTILINE)
 #: Nodes of a scenario that are no trackers.
 OTHERS = ("replay", "fusion_centre", "evaluator")
 
@@ -169,10 +171,16 @@ class Bringup:
         return self.trackers if rule else self.trackers[:1]
 
 
-def bringups() -> list[str]:
-    """Names of the parameter files that describe a scenario."""
-    folder = share_file("config")
-    return sorted(path.stem for path in folder.glob("*.yaml") if path.read_text().count("\nreplay:"))
+def bringups() -> dict[str, str]:
+    """List the parameter files that describe a scenario: name -> key of the scenario. Needs no YAML reader."""
+    files = sorted((path.stem, path) for path in share_file("config").glob("*.yaml"))
+    found = {name: _SCENARIO.search(path.read_text()) for name, path in files}
+    return {name: match[1] for name, match in found.items() if match}
+
+
+def demos_of(scenario: str) -> list[str]:
+    """Names of the parameter files with which a scenario runs over ROS."""
+    return [name for name, key in bringups().items() if key == scenario]
 
 
 def start_scenario(
