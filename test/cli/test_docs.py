@@ -12,6 +12,7 @@ import yaml
 from cli.runner import ROOT, refusal, run
 
 from track_fusion.cli.docs import Section, fusion_centre_sections, sensor_tracker_sections, yaml_value
+from track_fusion.nodes.bringup import bringups
 from track_fusion.params import specs
 from track_fusion.rules import RULES
 from track_fusion.scenarios import SCENARIOS
@@ -147,4 +148,4 @@ def test_the_page_of_scenarios_has_each_with_its_claims_and_assumptions() -> Non
         section = page.split(f"\n## {scenario.key}\n")[1].split("\n## ")[0]
         assert all(claim.text in section for claim in scenario.claims)
         assert section.count("* Assumed: ") == len(scenario.assumptions)
-        assert (f"`track-fusion demo {scenario.key}`" in section) == (scenario.tracking is not None)
+        assert (f"`track-fusion demo {scenario.key}`" in section) == (scenario.key in bringups().values())

@@ -21,20 +21,18 @@ from sensor_msgs.msg import PointCloud2
 from msg_adapters.arrays import merged
 from track_fusion.filters import extended
 from track_fusion.nodes.bringup import Bringup, bringups, local_environment, running, start_scenario
-from track_fusion.random_streams import stream
-from track_fusion.rules import RULES, SourceTracks, get_rule
+from track_fusion.rules import RULES, get_rule
 from track_fusion.scenarios import RuleChoice, get_scenario, li2022_linear, li2022_nonlinear
+from track_fusion.scenarios.chen2022_dynamic import fusions
 from track_fusion.scenarios.one_target import (
     GaussianFilter,
     Row,
-    Sample,
     Sir,
     drawn,
     gaussian_alone,
     gaussian_fused,
     sir_alone,
     sir_fused,
-    start,
 )
 
 SEED, RUN = 5, 2
@@ -60,28 +58,11 @@ def choice(name: str, rule: str) -> RuleChoice:
     return next(c for c in get_scenario(name).rules if c.name == rule)
 
 
-def sampled() -> Row:
-    """Kalman filters fused by a rule that draws samples, at its defaults; one stream from step to step."""
-    tracking, rule = li2022_linear.TRACKING, RULES["geometric_mean_sampling"]
-
-    def estimates(sample: Sample) -> Iterator[NDArray[np.float64]]:
-        rng, (mean, cov) = stream(SEED, RUN, "fusion_centre"), start(tracking, 1)
-        for k in range(tracking.steps):
-            mean, cov = KF.predict(mean, cov, tracking.motion.over(tracking.dt_s))
-            pairs = zip(sample.seen, tracking.sensors.values(), strict=True)
-            local = [KF.update(mean, cov, z[:, k], sensor)[:2] for z, sensor in pairs]
-            means, covs = (np.stack(parts, 1) for parts in zip(*local, strict=True))
-            fused = rule.fuse(SourceTracks(means, covs, extras={"seed": rng}), rule.params())
-            mean, cov = fused.mean, fused.cov
-            yield mean
-
-    return Row(estimates)
-
-
 def li2022() -> Iterator[Case]:
     linear, nonlinear, ckf = li2022_linear.TRACKING, li2022_nonlinear.TRACKING, li2022_nonlinear.CKF
     average, uniform = "arithmetic_average", {"covariance_intersection.criterion": "uniform"}
-    yield Case("li2022-linear", "geometric_mean_sampling", "", sampled())
+    sampled = RuleChoice("geometric_mean_sampling", RULES["geometric_mean_sampling"].params())
+    yield Case("li2022-linear", sampled.key, "", gaussian_fused(linear, KF, sampled))
     yield Case("li2022-linear-sir", average, "sir-arithmetic_average",
                sir_fused(linear, li2022_linear.SIR, choice("li2022-linear", average), union=True))  # fmt: skip
     for rule in ("naive", average):
@@ -97,7 +78,21 @@ def li2022() -> Iterator[Case]:
     yield Case("li2022-nonlinear-sir", None, "sir-alone", sir_alone(nonlinear, sir, 1))
 
 
-CASES = [*li2022()]
+def chen2022() -> Iterator[Case]:
+    """Any rule of each kind: elliptical, Gaussian, Gaussian with a parameter of its own."""
+    chosen = {"chen2022-dynamic-1": ("mhdp_iterative", "covariance_intersection@uniform"),
+              "chen2022-dynamic-2": ("mhdp_explicit", "quasi_minimal_manhattan")}  # fmt: skip
+    for name, rules in chosen.items():
+        base = get_scenario(name).tracking
+        assert base is not None
+        for rule in rules:
+            one = choice(name, rule)
+            row = Row(lambda sample, base=base, one=one: fusions(base, "stf", one, sample.seed, sample.runs))  # type: ignore[misc]
+            parameters = {"covariance_intersection.criterion": "uniform"} if one.variant else {}
+            yield Case(name, one.key, f"stf-{one.name}", row, parameters)
+
+
+CASES = [*li2022(), *chen2022()]
 
 
 def test_every_parameter_file_is_run() -> None:
@@ -145,7 +140,7 @@ def test_the_nodes_give_the_numbers_of_the_library(
     step_ns, axes = round(tracking.dt_s * 1e9), tracking.motion.layout.axes
     assert [stamp_ns(m) for m in messages] == [k * step_ns for k in range(1, tracking.steps + 1)]
     truth, sample = drawn(tracking, [RUN], SEED)
-    expected = np.array([mean[0] for mean in case.library.estimates(sample)])
+    expected = np.array([fused.mean[0] for fused in case.library.estimates(sample)])
     found = np.array([merged(read(m), axes)[0][0] for m in messages])
     scale = np.abs(expected).max(0)
     np.testing.assert_allclose(found / scale, expected / scale, rtol=0, atol=TOLERANCE)

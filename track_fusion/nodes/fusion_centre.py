@@ -86,7 +86,7 @@ class FusionCentreNode(ManagedNode):
         rule_params = {key: declare(self, rule.params, f"{key}.") for key, rule in RULES.items()}
         self.centre = FusionCentre(
             len(self.sources.source_configurations), motion, self.frame.frame_id, params,
-            rule_params[params.state_fusion], declare(self, TrackManagerParams), declare(self, RandomParams),
+            rule_params[params.state_fusion], declare(self, TrackManagerParams), random=declare(self, RandomParams),
         )  # fmt: skip
         self._buffer_params = declare(self, ScanBufferParams)
         self.buffer = ScanBuffer([k == "odometry" for k in self.sources.kinds], self._buffer_params)
