@@ -203,7 +203,7 @@ def charts(samples: Samples) -> list[Chart]:
             inner = CHART_WEIGHT[1:-1]  # at both ends the averages are equal
             excess = pair.excess(inner, CHART_THETA)
             levels = [level for level in EXCESS_LEVELS if excess.min() < level < excess.max()]
-            levelled = tuple(Contours(f"{level:+g}", inner, CHART_THETA, excess, (level,)) for level in levels)
+            levelled = tuple(Contours(f"{level:g}", inner, CHART_THETA, excess, (level,)) for level in levels)
             found.append(_plane(f"{title}: mean square error, arithmetic minus geometric", levelled))
     if f"{GA}@appendix/mean_1" in samples:
         found.append(_appendix_chart())
