@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from track_fusion.params import ParameterError
+from track_fusion.rules.harmonic_mean import HarmonicMeanParams
 from track_fusion.rules.mixture_exact import MixtureExactParams
 from track_fusion.scenarios import judged_claims, sharma_network_1, sharma_network_2
 from track_fusion.scenarios.base import RuleChoice
@@ -197,3 +198,12 @@ def test_compare_takes_any_rule_and_refuses_what_needs_more(samples, key):
     assert found["kf-ellipsoidal_intersection/error_1"].shape == (20,)
     with pytest.raises(ParameterError, match="Got 'mixture_exact', which needs 'common' beside"):
         scenario.compare([RuleChoice("mixture_exact", MixtureExactParams())], [0], 0, lambda share: None)
+
+
+def test_compare_draws_for_each_run_by_itself():
+    """A rule that samples: runs in a piece of their own give what they give among others."""
+    choice = RuleChoice("harmonic_mean", HarmonicMeanParams(method="sampling", samples=50))
+    whole = sharma_network_2.SCENARIO.compare([choice], [1, 2, 3], 4, lambda share: None)
+    part = sharma_network_2.SCENARIO.compare([choice], [3], 4, lambda share: None)
+    for name, values in whole.items():
+        np.testing.assert_allclose(part[name], values[2:], rtol=1e-9)

@@ -5,9 +5,10 @@ import pytest
 
 from track_fusion.params import ParameterError
 from track_fusion.random_streams import stream
+from track_fusion.rules.harmonic_mean import HarmonicMeanParams
 from track_fusion.rules.mixture_exact import MixtureExactParams
 from track_fusion.rules.naive import NaiveParams
-from track_fusion.scenarios import judged_claims
+from track_fusion.scenarios import judged_claims, sharma_scalar
 from track_fusion.scenarios.base import RuleChoice
 from track_fusion.scenarios.sharma_scalar import RULE_CHOICES, SCENARIO, SETTINGS, STEPS, figures, sample
 
@@ -107,3 +108,13 @@ def test_compare_takes_any_rule_and_refuses_what_needs_more(samples):
     assert (found[f"kf-naive/rmse_{name}_1"] ** 2).mean() == pytest.approx(steady, rel=0.05)
     with pytest.raises(ParameterError, match="Got 'mixture_exact', which needs 'common' beside"):
         SCENARIO.compare([RuleChoice("mixture_exact", MixtureExactParams())], [0], 0, lambda share: None)
+
+
+def test_compare_draws_for_each_run_by_itself(monkeypatch):
+    """A rule that samples: runs in a piece of their own give what they give among others."""
+    monkeypatch.setattr(sharma_scalar, "SETTINGS", SETTINGS[:1])
+    choice = RuleChoice("harmonic_mean", HarmonicMeanParams(method="sampling", samples=10))
+    whole = SCENARIO.compare([choice], [2, 3], 4, lambda share: None)
+    part = SCENARIO.compare([choice], [3], 4, lambda share: None)
+    for name, values in part.items():
+        np.testing.assert_allclose(values, whole[name][1:], rtol=1e-9)

@@ -139,3 +139,12 @@ def test_effective_samples_vanish_where_tracks_are_far_apart() -> None:
     near, lost = (run("geometric_mean_sampling", t).info for t in (GAUSSIANS, far))
     assert lost["ess"] < 0.1 * near["ess"]
     assert lost["log_eta"] < near["log_eta"] - 5.0
+
+
+def test_the_harmonic_mean_says_when_it_draws() -> None:
+    rule = get_rule("harmonic_mean")
+    assert not rule.uses("seed", rule.params())
+    assert rule.uses("seed", from_dict(rule.params, {"method": "sampling"}))
+    sampler = get_rule("geometric_mean_sampling")
+    assert sampler.uses("seed", sampler.params())
+    assert not sampler.uses("common", sampler.params())

@@ -84,6 +84,8 @@ class Rule:
     #: (extra, parameter, value): needed as well when the parameter has this value, and of no use otherwise
     needs_when: tuple[tuple[str, str, str], ...] = ()
     optional: tuple[str, ...] = ()  # names of `extras` that are used when given
+    #: (extra, parameter, value): an optional extra that is used only when the parameter has this value
+    optional_when: tuple[tuple[str, str, str], ...] = ()
     affine_equivariant: bool | str = True  # a string says why not, or under which parameters
     linear: bool = False  # the fused mean is linear in the means; all else depends on the covariances alone
 
@@ -100,6 +102,11 @@ class Rule:
         if missing:
             raise ValueError(f"The rule '{self.key}' needs '{missing[0]}' beside the tracks. Got none.")
         return self.fuse(tracks, params)
+
+    def uses(self, extra: str, params: Params) -> bool:
+        """Tell whether an optional extra makes a difference at these parameters."""
+        values = [getattr(params, key) == value for name, key, value in self.optional_when if name == extra]
+        return extra in self.optional and (any(values) or not values)
 
     def needed(self, params: Params) -> tuple[str, ...]:
         """Names of the extras without which the rule cannot do at these parameters."""

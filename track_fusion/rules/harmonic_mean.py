@@ -202,5 +202,6 @@ RULE = Rule(
     cost="K n^3; K S n^2 by S samples",
     order_matters=True,
     optional=("seed",),
+    optional_when=(("seed", "method", "sampling"),),
     affine_equivariant="not with criterion trace: the trace depends on the units of the axes",
 )

@@ -248,7 +248,7 @@ def fuse_runs(
         weights = None if fused.weights is None else fused.weights[:1]
         return FusedTracks(matvec(transpose(fused.mean), mean.reshape(runs, -1)), fused.cov[:1], weights)
     tracks = SourceTracks(mean, np.broadcast_to(cov, (runs, count, n, n)))
-    if rngs is None or "seed" not in rule.optional:
+    if rngs is None or not rule.uses("seed", params):
         return rule.fuse(tracks, params)
     each = [rule.fuse(_one_run(tracks, r, rng), params) for r, rng in enumerate(rngs)]
     weighed = [f.weights for f in each if f.weights is not None]

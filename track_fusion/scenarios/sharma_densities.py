@@ -61,7 +61,7 @@ class Pair:
         return Row(
             self,
             lambda rng: rule.fuse(dataclasses.replace(tracks, extras={"seed": rng}), choice.params),
-            "seed" in rule.optional and getattr(choice.params, "method", "sampling") != "gaussian",
+            rule.uses("seed", choice.params),
         )
 
     def by_grid(self, kind: Kind, inflation: float = 1.0) -> Row:

@@ -12,6 +12,7 @@ from track_fusion.linalg import Array, outer
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.metrics.consistency import nees
 from track_fusion.peers import Peer, Round, communicate
+from track_fusion.random_streams import stream
 from track_fusion.report.chart import Chart, Series, ellipse
 from track_fusion.rules import RULES
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
@@ -65,14 +66,17 @@ class Network:
     rounds: tuple[Round, ...]
     sink: str
 
-    def fused(self, local: Local, choice: RuleChoice) -> Tracks:
-        """Send estimates through the network, fused by a rule; return the sink's."""
+    def fused(self, local: Local, choice: RuleChoice, rngs: Sequence[np.random.Generator] | None = None) -> Tracks:
+        """Send estimates through the network, fused by a rule; return the sink's.
+
+        A rule that samples draws from each run's generator in `rngs`.
+        """
 
         def fuse(own: Tracks, heard: Tracks, common: Tracks | None, count: int) -> Tracks:
             size = max(len(own.cov), len(heard.cov))
             covs = [np.broadcast_to(t.cov, (size, *t.cov.shape[1:])) for t in (own, heard)]
             means = np.stack([own.mean, heard.mean], 1)
-            fused = fuse_runs(RULES[choice.key], choice.params, means, np.stack(covs, 1))
+            fused = fuse_runs(RULES[choice.key], choice.params, means, np.stack(covs, 1), rngs)
             return Tracks(fused.mean, fused.cov)
 
         peers = {name: Peer(tracks) for name, tracks in local.nodes.items()}
@@ -186,7 +190,8 @@ def compare(
     check_needs(rules)
     local, found = network.estimate(runs, seed), {}
     for done, choice in enumerate(rules):
-        error = network.fused(local, choice).mean - local.state
+        rngs = [stream(seed, run, "rule") for run in runs]
+        error = network.fused(local, choice, rngs).mean - local.state
         found[f"kf-{choice.name}/error_1"] = np.linalg.norm(error, axis=1)
         progress((done + 1) / len(rules))
     return found

@@ -12,11 +12,11 @@ from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate, armse
 from track_fusion.random_streams import stream
 from track_fusion.report.chart import Chart, Series
-from track_fusion.rules import RULES, SourceTracks
+from track_fusion.rules import RULES
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.harmonic_mean import HarmonicMeanParams
 from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
-from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, Scenario, check_needs, chosen
+from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, Scenario, check_needs, chosen, fuse_runs
 
 STEPS = 100
 
@@ -68,9 +68,15 @@ def correlated(normals: Array, deviations: Sequence[float], correlation: float) 
     return deviations[0] * normals[..., 0], deviations[1] * second
 
 
-def fuse(choice: RuleChoice, mean: Array, variance: Array) -> tuple[Array, Array, Array]:
+#: A generator a run, for rules that sample.
+Generators = Sequence[np.random.Generator]
+
+
+def fuse(
+    choice: RuleChoice, mean: Array, variance: Array, rngs: Generators | None = None
+) -> tuple[Array, Array, Array]:
     """Fuse scalar tracks, mean and variance (R, 2): mean, variance and weight omega (R,), NaN where it has none."""
-    fused = RULES[choice.key].fuse(SourceTracks(mean[..., None], variance[..., None, None]), choice.params)
+    fused = fuse_runs(RULES[choice.key], choice.params, mean[..., None], variance[..., None, None], rngs)
     weight = np.full(len(mean), np.nan) if fused.weights is None else fused.weights[:, 0]
     return fused.mean[:, 0], fused.cov[:, 0, 0], weight
 
@@ -83,12 +89,13 @@ class Track(NamedTuple):
     weight: Array
 
 
-def track(setting: Setting, choice: RuleChoice | None, normals: Array) -> Track:
+def track(setting: Setting, choice: RuleChoice | None, normals: Array, rngs: Generators | None = None) -> Track:
     """Fuse prior and measurement at steps 1 to T; without a rule take the measurement.
 
     Parameters
     ----------
     normals : (R, T + 1, 2)    standard; the first estimate is the measurement of step 0
+    rngs                       a generator a run, for a rule that samples
     """
     process, noise = correlated(normals, (np.sqrt(setting.ratio), 1.0), setting.correlation)
     truth = np.cumsum(process, 1)
@@ -100,7 +107,7 @@ def track(setting: Setting, choice: RuleChoice | None, normals: Array) -> Track:
             estimate, variance, weight = z[:, k], one, 0.0 * one
         else:
             pair = np.stack([estimate, z[:, k]], 1), np.stack([variance + setting.ratio, one], 1)
-            estimate, variance, weight = fuse(choice, *pair)
+            estimate, variance, weight = fuse(choice, *pair, rngs)
         square = (estimate - truth[:, k]) ** 2
         for values, value in zip(found, (square, square / variance, weight), strict=True):
             values[:, k - 1] = value
@@ -222,7 +229,8 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
     found: Samples = {}
     for done, choice in enumerate(rules):
         for setting in SETTINGS:
-            square = track(setting, choice, normals).square
+            rngs = [stream(seed, run, "rule") for run in runs]
+            square = track(setting, choice, normals, rngs).square
             found[f"kf-{choice.name}/rmse_{setting.name}_1"] = np.sqrt(square.mean(1))
         progress((done + 1) / len(rules))
     return found
