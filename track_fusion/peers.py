@@ -10,12 +10,13 @@ Consistency
   it: nothing is counted twice, however often peers talk. On a tree, without process noise, and when every message
   arrives, each density is exactly the one given all data whose news reached the peer; after a :func:`sweep` that
   is the centralised one. Loops are refused: news that comes round two ways is in no single channel. Process noise is
-  common to all peers but drawn from each channel as if it were its own: then fusion is exact only for two
-  peers that exchange at every step, and else an approximation that may be optimistic. For mixtures: up to the rule's
-  sampling and reduction.
+  common to all peers, which channels know in part: then fusion is exact only for two peers that exchange at every
+  step, and else an approximation, optimistic by a few per cent (NEES 1.05 on a chain of five). For mixtures: up to
+  the rule's sampling and reduction.
 * Without channels it depends on the rule. A conservative one (covariance intersection, for Gaussians) is consistent
   on any topology, loops included. Naive fusion counts whatever two peers share again with each message (data
-  incest): two peers that start from one prior and exchange what they have already claim it twice.
+  incest): two peers that start from one prior and exchange what they have already claim it twice; five peers after
+  three sweeps over a tree claim less than a hundredth of their mean squared error.
 
 Example
 -------

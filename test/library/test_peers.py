@@ -131,7 +131,8 @@ def test_without_channels_naive_fusion_counts_the_prior_and_old_news_again():
         return float(((mean - truth) ** 2).sum(1).mean() / np.trace(cov[0]))
 
     assert error_over_claim(exact["d"]) == pytest.approx(1.0, abs=3 * np.sqrt(2 / RUNS))
-    assert error_over_claim(naive["d"]) > 10
+    for peer in naive.values():
+        assert error_over_claim(peer) > 100 * (1 - 3 * np.sqrt(2 / RUNS))
     # Two peers, one prior, no measurement: the prior is claimed twice.
     twice = communicate({"a": Peer(prior()), "b": Peer(prior())}, [("a", "b")], NAIVE)["b"].moments[1][0]
     np.testing.assert_allclose(twice, PRIOR_COV / 2, rtol=1e-12)

@@ -294,7 +294,8 @@ def _over_time(samples: Samples, rows: Iterable[str], p: int, title: str, axes: 
         error, bound = norms(samples, row, axes), bounds(samples, row, axes)
         at, steps = min(p, error.shape[1] - 1), np.arange(1, error.shape[2] + 1)
         lines.append(Series(LABELS[row], steps, rmse(error[:, at] ** 2)))
-        lines.append(Series(f"{LABELS[row]}, 2 sigma", steps, bound[:, at].mean(0), "dashed"))
+        if row in (BY_FOCI, BY_IGS):
+            lines.append(Series(f"{LABELS[row]}, 2 sigma", steps, bound[:, at].mean(0), "dashed"))
     return Chart(title, "time, s", unit, tuple(lines), log_y=True)
 
 
