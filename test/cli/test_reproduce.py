@@ -108,14 +108,14 @@ def test_the_linear_scenario_as_json() -> None:
 
 def test_a_seed_decides_the_figures() -> None:
     first, again, other = (
-        reproduced("li2022-linear", "--only", "kf-", "--runs", "2", "--seed", s) for s in ("5", "5", "6")
+        reproduced("li2022-linear", "--only", "kf-a", "--runs", "2", "--seed", s) for s in ("5", "5", "6")
     )
     assert first == again
     assert first["figures"][0]["value"] != other["figures"][0]["value"]
 
 
 def test_of_one_run_the_error_is_not_known() -> None:
-    answer = reproduced("li2022-linear", "--only", "kf-", "--runs", "1")
+    answer = reproduced("li2022-linear", "--only", "kf-a", "--runs", "1")
     assert {f["standard_error"] for f in answer["figures"]} == {None}
     assert {f["verdict"] for f in answer["figures"]} == {"not given"}
 
@@ -136,7 +136,7 @@ def test_no_figure_depends_on_the_number_of_processes(tmp_path: Path) -> None:
     texts = []
     for jobs in ("1", "3"):
         out = tmp_path / f"jobs{jobs}"
-        words = ("li2022-linear", "--only", "kf-", "--runs", "120", "--jobs", jobs, "--out", str(out))
+        words = ("li2022-linear", "--only", "kf-a", "--runs", "120", "--jobs", jobs, "--out", str(out))
         assert run("reproduce", *words).exit_code == 0
         texts.append((out / "results.json").read_bytes())
     assert texts[0] == texts[1]

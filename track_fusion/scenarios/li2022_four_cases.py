@@ -188,7 +188,7 @@ def _picture(case: str, rows: Iterable[str], samples: Samples) -> Chart:
         if f"{row}/mean" in samples:
             mean, cov = samples[f"{row}/mean"][0, at], samples[f"{row}/cov"][0, at]
             lines.append(ellipse(row.partition("-")[2], mean, cov, 1.0))
-    title = f"({case}) means {SEPARATIONS[case]:g} m apart along x: ellipses of one standard deviation"
+    title = f"({case}) means {SEPARATIONS[case]:g} m apart along x, one-sigma ellipses"
     return Chart(title, "x / m", "y / m", tuple(lines), equal=True)
 
 

@@ -175,14 +175,15 @@ class OneTargetStudy:
 
     def _errors(self, name: str, q: Quantity, rows: Iterable[str], samples: Samples) -> Chart:
         values = {row: rmse(_squares(samples[f"{row}/{q.error}"])) for row in rows}
-        return _over_steps(f"{name.upper()}: {q.name} RMSE", f"{q.name} RMSE / {q.unit.replace('ps', '/s')}", values)
+        what = f"{q.name.replace('_', ' ')} RMSE"
+        return _over_steps(f"{name.upper()}: {what}", f"{what} / {q.unit.replace('ps', '/s')}", values)
 
     def _credibility(self, name: str, rows: Iterable[str], samples: Samples) -> Chart:
         values = {}
         for row in rows:
             claimed, squares = samples[f"{row}/{CLAIMED}"], self._position_squares(samples, row)
             values[row] = claimed.mean(0) / squares.mean(0)
-        title = f"{name.upper()}: claimed over actual position mean squared error, 1 = credible"
+        title = f"{name.upper()}: claimed over actual position MSE, 1 = credible"
         return dataclasses.replace(_over_steps(title, "claimed / actual", values), log_y=True)
 
 
