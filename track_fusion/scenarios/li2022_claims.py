@@ -1,4 +1,4 @@
-"""What section IV of Li 2022 says of its filters and rules in words, in both scenarios."""
+"""What section IV of Li 2022 says of its filters and rules in words, and what it leaves open, in both scenarios."""
 
 from __future__ import annotations
 
@@ -13,6 +13,24 @@ AVERAGE, INTERSECTION, UNION = RULES[3:]
 UNION_ANYWHERE = "covariance_union@optimal_mean"
 POSITION, VELOCITY = "position_armse_m", "velocity_armse_mps"
 CLAIMED, CREDIBILITY, WEIGHT = "position_claimed_m", "position_credibility_1", "sensor_1_weight_1"
+
+#: What section IV leaves open in both scenarios.
+ASSUMPTIONS = (
+    "the fused posterior is fed back to both filters at every step",
+    "the truth starts exactly at the initial mean, the filters at the initial mean and covariance",
+    "error: 2-norm, root-mean-square over runs at each step, averaged over the 100 steps",
+    "covariance intersection by the trace, (18); @uniform is the geometric average at w = 1/2, (16)-(17)",
+    "covariance union: no least upper bound exists, so the covariance of least trace that covers both tracks is taken, "
+    "about the arithmetic average (7), or @optimal_mean about the mean at which it is least; @max_trace is (8) with "
+    "footnote 3. No reading gives the printed rows of both tables",
+    "claimed over actual: trace of the position covariance over the squared position error, each averaged over runs "
+    "and steps",
+    "assumed: SIR resamples systematically after every step (the scheme is not given; @multinomial: by independent "
+    "draws); estimates are made before it",
+    "each SIR filter draws again from the fused density by itself (arithmetic average: from the union of the weighted "
+    "particles, @gaussian: after conversion)",
+    "assumed: particles turned into a Gaussian: 1e-9 of the initial variances is added",
+)
 
 
 def named(quantity: str, one: str, *rules: str) -> tuple[str, ...]:

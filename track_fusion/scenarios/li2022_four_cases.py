@@ -80,13 +80,18 @@ def all_cases() -> SourceTracks:
     return SourceTracks(np.stack([p.mean for p in pairs]), np.stack([p.cov for p in pairs]))
 
 
+def draws(choice: RuleChoice | None) -> bool:
+    """Whether the rule samples, so that each run has a result of its own."""
+    return choice is not None and RULES[choice.key].uses("seed", choice.params)
+
+
 def fused(row: str, choice: RuleChoice | None, seed: int, run: int) -> FusedTracks:
     """Fuse all cases; a rule that samples draws anew in each run."""
     tracks = all_cases()
     if choice is None:
         at = TRACKS.index(row)
         return FusedTracks(tracks.mean[:, at], tracks.cov[:, at])
-    if "seed" in RULES[choice.key].optional:
+    if draws(choice):
         tracks = dataclasses.replace(tracks, extras={"seed": stream(seed, run, "fusion_centre")})
     return RULES[choice.key](tracks, choice.params)
 
@@ -101,7 +106,8 @@ def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -
     """
     rows, found = chosen(ROWS, only), {}
     for done, (row, choice) in enumerate(rows.items()):
-        each = [fused(row, choice, seed, run) for run in runs]
+        each = [fused(row, choice, seed, run) for run in (runs if draws(choice) else runs[:1])]
+        each *= len(runs) // len(each)
         if row == MIXTURE:
             found[f"{row}/modes"] = np.array([modes(f.mixture) for f in each])
         else:
@@ -141,17 +147,16 @@ def figures(samples: Samples) -> dict[str, Estimate]:
         for i, case in enumerate(SEPARATIONS):
             if what == "cov":
                 cov = values[:, i]
-                found[f"{row}/trace_case_{case}_m2"] = _over_runs(np.trace(cov, axis1=1, axis2=2))
-                found[f"{row}/determinant_case_{case}_m4"] = _over_runs(np.linalg.det(cov))
+                found[f"{row}/trace_case_{case}_m2"] = _over_runs(row, np.trace(cov, axis1=1, axis2=2))
+                found[f"{row}/determinant_case_{case}_m4"] = _over_runs(row, np.linalg.det(cov))
             elif what in ("weight", "modes"):
-                found[f"{row}/{what}_case_{case}_1"] = _over_runs(values[:, i])
+                found[f"{row}/{what}_case_{case}_1"] = _over_runs(row, values[:, i])
     return found
 
 
-def _over_runs(values: Array) -> Estimate:
-    """Average (R,) of what a rule gives; it is exact where the runs show that nothing is drawn."""
-    exact = len(values) > 1 and bool((values == values[0]).all())
-    return Estimate.exact(values[0]) if exact else Estimate.mean(values)
+def _over_runs(row: str, values: Array) -> Estimate:
+    """Average (R,) of what a rule gives, which is exact where nothing is drawn."""
+    return Estimate.mean(values) if draws(ROWS[row]) else Estimate.exact(values[0])
 
 
 def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:

@@ -13,6 +13,7 @@ from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.rules import RULES, FusedTracks
 from track_fusion.scenarios.base import Claim, RuleChoice, Scenario, Tracking, fuse_runs
 from track_fusion.scenarios.li2022_claims import (
+    ASSUMPTIONS,
     AVERAGE,
     CREDIBILITY,
     INTERSECTION,
@@ -180,20 +181,7 @@ SCENARIO = Scenario(
     published_runs=100,
     default_runs=200,
     publication_runs=1000,
-    assumptions=(
-        "the fused posterior is fed back to both filters at every step",
-        "the truth starts exactly at the initial mean, the filters at the initial mean and covariance",
-        "error: 2-norm, root-mean-square over runs at each step, averaged over the 100 steps",
-        "covariance intersection by the trace, (18); @uniform is the geometric average at w = 1/2, (16)-(17)",
-        "covariance union: no least upper bound exists, so the covariance of least trace that covers both tracks is "
-        "taken, about the arithmetic average (7), or @optimal_mean about the mean at which it is least; @max_trace is "
-        "(8) with footnote 3. The printed rows come out of none of them",
-        "claimed over actual: trace of the position covariance over the squared position error, both averaged over "
-        "runs and steps",
-        "SIR: systematic resampling after every step; estimates before it; each filter draws again from the fused "
-        "density by itself (arithmetic average: from the union of the weighted particles, @gaussian: after conversion)",
-        "particles turned into a Gaussian: 1e-9 of the initial variances is added",
-    ),
+    assumptions=ASSUMPTIONS,
     sample=STUDY.sample,
     figures=STUDY.figures,
     charts=STUDY.charts,

@@ -165,8 +165,13 @@ def sir_fused(tracking: Tracking, sir: Sir, choice: RuleChoice, union: bool = Fa
 
 
 def sir_rows(tracking: Tracking, sir: Sir, choices: Sequence[RuleChoice]) -> dict[str, Row]:
-    """Every row by particle filters; the arithmetic average joins the particles, or (@gaussian) their Gaussians."""
+    """Every row by particle filters; the arithmetic average joins the particles, or (@gaussian) their Gaussians.
+
+    Without fusion also by multinomial resampling, whose draws are independent and add more noise.
+    """
     table = {"sir-alone": sir_alone(tracking, sir, 1), "sir-ic": sir_alone(tracking, sir, 2)}
+    noisier = dataclasses.replace(sir, resampling="multinomial")
+    table |= {f"{row}@multinomial": sir_alone(tracking, noisier, i) for i, row in enumerate(list(table), 1)}
     for choice in choices:
         averaged = choice.key == "arithmetic_average"
         table[f"sir-{choice.name}"] = sir_fused(tracking, sir, choice, union=averaged)

@@ -21,7 +21,7 @@ WEIGHT = "sensor_1_weight_1"
 #: Rows, by their rules, whose weight on sensor 1 is kept: those that seek it for the sake of the fused density.
 WEIGHED = ("arithmetic_average", "arithmetic_average@gaussian", "covariance_intersection")
 #: Variants left out of the charts, which hold eight lines.
-NOT_DRAWN = ("arithmetic_average@gaussian", "covariance_union@max_trace")
+NOT_DRAWN = ("alone@multinomial", "ic@multinomial", "arithmetic_average@gaussian", "covariance_union@max_trace")
 #: A chart whose largest value exceeds its smallest so many times has a logarithmic axis.
 LOGARITHMIC_FROM = 10.0
 
