@@ -53,6 +53,13 @@ def test_covariance_union_of_table_2_is_a_valid_bound_and_worse_than_the_average
     assert credibility["ckf-arithmetic_average"] < nonlinear["ckf-covariance_union/position_credibility_1"].value
 
 
+def test_the_union_of_least_determinant_keeps_the_turn_rate_in_bounds():
+    """In this run the bound of least trace, in metres and radians at once, lets it grow to 10^4 deg/s."""
+    part = dataclasses.replace(li2022_nonlinear.STUDY, rows={"u": li2022_nonlinear.STUDY.rows["sir-covariance_union"]})
+    errors = part.sample([219], 0, lambda share: None)["u/turn_rate_error_degps"]
+    assert np.abs(errors).max() < 15.0
+
+
 def test_particle_rows_of_table_1():
     names = (
         "sir-alone",

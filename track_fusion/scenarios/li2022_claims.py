@@ -20,9 +20,10 @@ ASSUMPTIONS = (
     "the truth starts exactly at the initial mean, the filters at the initial mean and covariance",
     "error: 2-norm, root-mean-square over runs at each step, averaged over the 100 steps",
     "covariance intersection by the trace, (18); @uniform is the geometric average at w = 1/2, (16)-(17)",
-    "covariance union: no least upper bound exists, so the covariance of least trace that covers both tracks is taken, "
-    "about the arithmetic average (7), or @optimal_mean about the mean at which it is least; @max_trace is (8) with "
-    "footnote 3. No reading gives the printed rows of both tables",
+    "covariance union: no least upper bound exists, so the covariance of least determinant that covers both tracks is "
+    "taken, about the arithmetic average (7), or @optimal_mean about the mean at which it is least; @max_trace is (8) "
+    "with footnote 3. By least trace, whose axes have different units, a turn rate diverges in some runs. No reading "
+    "gives the printed rows of both tables",
     "claimed over actual: trace of the position covariance over the squared position error, each averaged over runs "
     "and steps",
     "assumed: SIR resamples systematically after every step (the scheme is not given; @multinomial: by independent "

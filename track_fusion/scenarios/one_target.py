@@ -38,8 +38,8 @@ RULE_CHOICES = (
     RuleChoice("arithmetic_average", ArithmeticAverageParams(criterion="diversity")),
     RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="trace")),
     RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="uniform"), "uniform"),
-    RuleChoice("covariance_union", CovarianceUnionParams(criterion="trace", mean="diversity")),
-    RuleChoice("covariance_union", CovarianceUnionParams(criterion="trace", mean="optimal"), "optimal_mean"),
+    RuleChoice("covariance_union", CovarianceUnionParams(criterion="det", mean="diversity")),
+    RuleChoice("covariance_union", CovarianceUnionParams(criterion="det", mean="optimal"), "optimal_mean"),
     RuleChoice("covariance_union", CovarianceUnionParams(bound="max_trace", mean="diversity"), "max_trace"),
 )
 
