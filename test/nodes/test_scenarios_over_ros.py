@@ -6,6 +6,7 @@ depends on the feedback.
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,7 +23,7 @@ from msg_adapters.arrays import merged
 from track_fusion.filters import extended
 from track_fusion.nodes.bringup import Bringup, bringups, local_environment, running, start_scenario
 from track_fusion.rules import RULES, get_rule
-from track_fusion.scenarios import RuleChoice, get_scenario, li2022_linear, li2022_nonlinear
+from track_fusion.scenarios import RuleChoice, get_scenario, li2022_linear, li2022_nonlinear, sharma_radar_runs
 from track_fusion.scenarios.chen2022_dynamic import fusions
 from track_fusion.scenarios.one_target import (
     GaussianFilter,
@@ -49,6 +50,7 @@ class Case(NamedTuple):
     row: str
     library: Row
     parameters: dict[str, Any] = {}
+    steps: int = 0  # 0: all
 
     def __str__(self) -> str:
         return f"{self.name}:{self.rule or 'alone'}"
@@ -93,11 +95,12 @@ def chen2022() -> Iterator[Case]:
 
 
 CASES = [*li2022(), *chen2022()]
+RADARS, RADAR_STEPS = "sharma-radars", 60
 
 
 def test_every_parameter_file_is_run() -> None:
     tested_elsewhere = {"li2022-linear"}  # test_lockstep.py
-    assert {c.name for c in CASES} | tested_elsewhere == set(bringups())
+    assert {c.name for c in CASES} | tested_elsewhere | {RADARS} == set(bringups())
 
 
 def run(case: Case, context: Any, domain: int, folder: Path) -> tuple[list[PointCloud2], dict[str, Any]]:
@@ -111,17 +114,19 @@ def run(case: Case, context: Any, domain: int, folder: Path) -> tuple[list[Point
     overrides["replay"] = {"seed": SEED, "run": RUN, "deadline_s": START_S}
     overrides["evaluator"] = {"output": str(judged)}
     publisher = "fusion_centre" if case.rule else trackers[0]
-    overrides[publisher]["expected_subscribers"] = 3 + (len(trackers) if case.rule else 0)  # replay, evaluator, test
+    readers = bringup.sections["fusion_centre"]["expected_subscribers"] if case.rule else 2
+    overrides[publisher]["expected_subscribers"] = readers + 1  # this test
+    steps = case.steps or get_scenario(bringup.scenario).played().steps
+    results = steps // bringup.result_every
+    overrides["replay"]["steps"], overrides["evaluator"]["steps"] = steps, results
     messages: list[PointCloud2] = []
-    tracking = get_scenario(bringup.scenario).tracking
-    assert tracking is not None
     with Probe(context) as probe, running(local_environment(domain), log) as nodes:
         messages = probe.listen(fused, PointCloud2, 1000)
         start_scenario(nodes, case.name, case.rule, overrides)
 
         def done() -> bool:
             assert nodes.failed() is None, f"{nodes.failed()} failed: {log.read_text()}"
-            return len(messages) >= tracking.steps
+            return len(messages) >= results
 
         probe.wait_for(done, RUN_S, "all steps")
         for name in ("replay", "evaluator"):
@@ -164,3 +169,38 @@ def compare_figures(case: Case, judged: dict[str, Any], error: NDArray[np.float6
     assert own
     for quantity, value in own.items():
         assert judged[quantity] == pytest.approx(value, rel=TOLERANCE), quantity
+
+
+@pytest.mark.parametrize("rule", ["harmonic_mean", "covariance_intersection"])
+def test_radars_in_clutter_give_the_tracks_of_the_library(
+    rule: str, ros_context: Any, ros_domain: int, tmp_path: Path
+) -> None:
+    """Every fusion depends on the one before: the centre fuses its own prediction, too."""
+    pytest.importorskip("pymap3d")
+    case = Case(RADARS, rule, "", Row(lambda sample: iter(())), steps=RADAR_STEPS)
+    messages, judged = run(case, ros_context, ros_domain, tmp_path)
+    own = sharma_radar_runs.centre(choice(RADARS, rule))
+    fusions = sharma_radar_runs.local_tracks(SEED, RUN, lambda share: None)
+    expected = [own.step(*fusion) for fusion in itertools.islice(fusions, len(messages))]
+    assert len(messages) == RADAR_STEPS // sharma_radar_runs.FUSION_SCANS
+    assert [stamp_ns(m) for m in messages] == [
+        round(t * 1e9) for t in sharma_radar_runs.FUSION_TIMES_S[: len(messages)]
+    ]
+    assert len(expected[-1][0]) > 10
+    for msg, (tracks, _) in zip(messages, expected, strict=True):
+        found = read(msg)
+        for field in ("track_id", "source", "status"):
+            np.testing.assert_array_equal(getattr(found, field), getattr(tracks, field))
+        for field in ("mean", "cov", "existence"):
+            want = getattr(tracks, field)
+            np.testing.assert_allclose(
+                getattr(found, field), want, rtol=0, atol=TOLERANCE * np.abs(want).max(initial=1.0)
+            )
+    truth = sharma_radar_runs.scene().truth(SEED, RUN)[:: sharma_radar_runs.FUSION_SCANS][1 : len(messages) + 1]
+    of_step = [sharma_radar_runs.judged(tracks, states) for (tracks, _), states in zip(expected, truth, strict=True)]
+    found_targets = sum(int(np.isfinite(step.nees).sum()) for step in of_step)
+    assert (judged["times"], judged["all"]["samples"]) == (len(messages), found_targets)
+    assert judged["missed"] == truth.shape[1] * len(messages) - found_targets
+    assert judged["false"] == sum(int(step.false) for step in of_step)
+    scores = np.concatenate([step.nees for step in of_step])
+    assert judged["all"]["anees"] == pytest.approx(np.nanmean(scores) / 4, rel=TOLERANCE)

@@ -211,7 +211,7 @@ def sensor_tracker_sections() -> list[Section]:
     from track_fusion.models.choices import MOTIONS, SENSORS, Choice
     from track_fusion.nodes.frames import FrameParams
     from track_fusion.nodes.managed import ManagedParams
-    from track_fusion.nodes.sensor_tracker import FeedbackParams
+    from track_fusion.nodes.sensor_tracker import FeedbackParams, OutputParams
     from track_fusion.pda_tracker import PdaTracker, PdaTrackerParams
     from track_fusion.sensor_tracker import MULTI_TARGET, SensorTrackerParams, TrackerChoice
     from track_fusion.track_filters import TRACK_FILTERS
@@ -223,7 +223,7 @@ def sensor_tracker_sections() -> list[Section]:
         *_alternatives("motion", MOTIONS, default.motion),
         *_alternatives("sensor", SENSORS, default.sensor),
         *_alternatives("filter", filters, default.filter),
-        *map(Section, (SensorTrackerParams, FeedbackParams, ManagedParams)),
+        *map(Section, (SensorTrackerParams, FeedbackParams, OutputParams, ManagedParams)),
     ]
 
 

@@ -133,6 +133,8 @@ class Bringup:
     scenario : str              key of the scenario
     trackers : tuple of str     names of the tracker nodes, those of the scenario's sensors
     filter : str                of the trackers
+    result_every : int          the centre fuses at every so many steps
+    sections : mapping          parameters of each node by name, as the file gives them
     """
 
     def __init__(self, name: str) -> None:
@@ -143,25 +145,24 @@ class Bringup:
             raise unknown_name_error(name, known, "parameter file of a scenario")
         self.path = share_file("config", f"{name}.yaml")
         content = yaml.safe_load(self.path.read_text())
-        self._sections = {node: section["ros__parameters"] for node, section in content.items()}
-        self.scenario = str(self._sections["replay"]["scenario"])
-        self.trackers = tuple(node for node in self._sections if node not in OTHERS)
-        self.filter = str(self._sections[self.trackers[0]].get("filter", "kalman"))
+        self.sections = {node: section["ros__parameters"] for node, section in content.items()}
+        self.scenario = str(self.sections["replay"]["scenario"])
+        self.trackers = tuple(node for node in self.sections if node not in OTHERS)
+        self.filter = str(self.sections[self.trackers[0]].get("filter", "kalman"))
+        self.result_every = int(self.sections["replay"].get("result_every", 1))
 
     def on_top(self, name: str, rule: str | None, random: Mapping[str, Any]) -> dict[str, Any]:
         """Parameters of a node on top of the file: the rule (None: none), and seed and run for all who draw."""
         from track_fusion.scenarios import get_scenario
 
-        draws = name in ("replay", "fusion_centre") or self._sections[name].get("filter") == "particle"
+        draws = name in ("replay", "fusion_centre") or self.sections[name].get("filter") == "particle"
         given = dict(random) if draws else {}
         if name == "replay":
             given["sensors"] = list(self.trackers_of(rule))
         elif name == "fusion_centre":
             given["state_fusion"] = rule
         elif name == "evaluator":
-            tracking = get_scenario(self.scenario).tracking
-            assert tracking is not None
-            given["steps"] = tracking.steps
+            given["steps"] = get_scenario(self.scenario).played().steps // self.result_every
         elif rule is None:
             given["feedback"] = "none"
         return given

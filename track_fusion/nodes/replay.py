@@ -21,7 +21,7 @@ from track_fusion.nodes.bag_player import BagParams, BagPlayer
 from track_fusion.nodes.managed import Fault, ManagedNode, end, qos, run
 from track_fusion.nodes.ros_params import declare
 from track_fusion.params import ParameterError, Params, param, unknown_name_error
-from track_fusion.scenarios import SCENARIOS, Tracking, get_scenario
+from track_fusion.scenarios import SCENARIOS, get_scenario
 from track_fusion.tracks import TrackBatch
 
 SECOND_NS = 1_000_000_000
@@ -40,7 +40,7 @@ class ReplayParams(Params):
     scenario: str = param(
         "li2022-linear",
         "the scenario to replay",
-        choices=tuple(k for k, s in SCENARIOS.items() if s.tracking is not None),
+        choices=tuple(key for key, scenario in SCENARIOS.items() if scenario.over_ros),
     )
     bag: str = param("", "a rosbag2 directory to play instead of a scenario")
     seed: int = param(0, "seed of the random streams", low=0)
@@ -53,6 +53,12 @@ class ReplayParams(Params):
         "lockstep: publish a step when the result of the one before has come back on ~/fused; "
         "realtime: by the wall clock, times 'rate'",
         choices=("lockstep", "realtime"),
+    )
+    result_every: int = param(
+        1, "at pace lockstep, wait for the result of every n-th step: centre and trackers work at that period", low=1
+    )
+    detection_covariances: bool = param(
+        True, "send the sensor's noise with each detection; false: the trackers' parameters give it"
     )
     rate: float = param(
         1.0, "seconds of scenario or bag time a second of wall time, at pace realtime", low=0.0, strict=True
@@ -96,16 +102,14 @@ class ReplayNode(ManagedNode):
         self._started = False
 
     def _connect_scenario(self) -> None:
-        tracking = get_scenario(self.params.scenario).tracking
-        assert isinstance(tracking, Tracking)
-        self._tracking = tracking
-        names = self.params.sensors or tuple(tracking.sensors)
+        self._scene = get_scenario(self.params.scenario).played()
+        names = self.params.sensors or tuple(self._scene.sensors)
         for name in names:
-            if name not in tracking.sensors:
-                raise unknown_name_error(name, tracking.sensors, "sensor")
-        self._steps = self.params.steps or tracking.steps
-        self._states = tracking.truth(self.params.seed, self.params.run, self._steps)
-        self._drawn = tracking.measurements(self._states, self.params.seed, self.params.run)
+            if name not in self._scene.sensors:
+                raise unknown_name_error(name, self._scene.sensors, "sensor")
+        self._steps = self.params.steps or self._scene.steps
+        draw = self.params.seed, self.params.run, self._steps
+        self._states, self._drawn = self._scene.truth(*draw), self._scene.detections(*draw)
         self._truth = self.publisher(Odometry, "~/truth", depth=100)
         self._detections = {name: self.publisher(PointCloud2, f"~/{name}/detections") for name in names}
         self._wanted = dict.fromkeys(self._detections.values(), self.params.expected_subscribers_each)
@@ -154,19 +158,21 @@ class ReplayNode(ManagedNode):
         if self.params.bag:
             self._player.start(self._finish)
             return
-        if self._step == self._steps:
-            self._finish()
-            return
-        self._step += 1
-        self._publish_step(self._step)
-        self._waiting_since = time.monotonic()
-        if self.params.pace == "realtime":
-            if self._step == 1:
-                period = self._tracking.dt_s / self.params.rate
-                self._pacer = self.create_timer(period, self._next, clock=self._wall)
+        while self._step < self._steps:
+            self._step += 1
+            self._publish_step(self._step)
+            self._waiting_since = time.monotonic()
+            if self.params.pace == "realtime":
+                if self._step == 1:
+                    period = self._scene.dt_s / self.params.rate
+                    self._pacer = self.create_timer(period, self._next, clock=self._wall)
+                return
+            if self._step % self.params.result_every == 0:
+                return
+        self._finish()
 
     def _stamp_ns(self) -> int:
-        return round(self._step * self._tracking.dt_s * SECOND_NS)
+        return round(self._step * self._scene.dt_s * SECOND_NS)
 
     def _tell_time(self) -> None:
         self._clock_out.publish(ClockMessage(clock=stamp_from_ns(self._stamp_ns())))
@@ -174,18 +180,19 @@ class ReplayNode(ManagedNode):
     def _publish_step(self, step: int) -> None:
         stamp_ns = self._stamp_ns()
         self._tell_time()
-        layout = self._tracking.motion.layout
+        layout, states = self._scene.layout, self._states[step]
+        there = np.flatnonzero(np.isfinite(states).all(1))
+        sharp = np.tile(TRUTH_VARIANCE * np.eye(layout.size), (len(there), 1, 1))
         truth = TrackBatch.gaussian(
-            layout, self.params.frame_id, self._states[step][None], TRUTH_VARIANCE * np.eye(layout.size)[None],
-            time_ns=stamp_ns, track_id=[1],
-        )  # fmt: skip
+            layout, self.params.frame_id, states[there], sharp, time_ns=stamp_ns, track_id=1 + there
+        )
         for msg in odometry_to_msgs(truth, layout.axes):
             self._truth.publish(msg)
         for name, pub in self._detections.items():
-            sensor = self._tracking.sensors[name]
-            scan = DetectionArrays(
-                sensor.axes, self.params.frame_id, stamp_ns, self._drawn[name][step - 1][None], sensor.noise[None]
-            )
+            sensor, z = self._scene.sensors[name], self._drawn[name][step - 1]
+            noise = np.broadcast_to(sensor.noise, (len(z), *sensor.noise.shape))
+            covs = noise if self.params.detection_covariances else None
+            scan = DetectionArrays(sensor.axes, self.params.frame_id, stamp_ns, z, covs)
             pub.publish(detection_table_to_msg(scan))
 
     def _on_fused(self, msg: Any) -> None:

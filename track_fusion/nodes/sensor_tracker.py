@@ -43,6 +43,13 @@ class FeedbackParams(Params):
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class OutputParams(Params):
+    """How often a tracker tells its tracks."""
+
+    publish_every: int = param(1, "publish the tracks of every n-th scan only", low=1)
+
+
 class SensorTrackerNode(ManagedNode):
     """Carries messages to a :class:`track_fusion.sensor_tracker.SensorTracker`, or a multi-target tracker.
 
@@ -53,11 +60,11 @@ class SensorTrackerNode(ManagedNode):
     def declare_parameters_(self) -> None:
         """Declare parameters and build the tracker."""
         self.frame = declare(self, FrameParams)
-        self.feedback = declare(self, FeedbackParams)
+        self.feedback, self.output = declare(self, FeedbackParams), declare(self, OutputParams)
         self.tracker = self._made(declare(self, TrackerChoice))
         self._queue: deque[DetectionArrays] = deque()
         self._awaited_ns = -1
-        self._asked_ns = 0
+        self._asked_ns = self._taken = 0
 
     def _made(self, choice: TrackerChoice) -> SensorTracker | PdaTracker:
         """Declare the parameters of motion, sensor and filter, and make the tracker of them."""
@@ -90,6 +97,7 @@ class SensorTrackerNode(ManagedNode):
         """Go back to the initial state."""
         self.on_stop()
         self.tracker.reset()
+        self._taken = 0
 
     def on_stop(self) -> None:
         """Drop waiting scans."""
@@ -133,10 +141,13 @@ class SensorTrackerNode(ManagedNode):
             self.reject({"duplicate_scan" if same else "out_of_order_scan": 1})
             return
         batch = self.tracker.step(scan.time_ns, *screened_detections(self, scan))
+        self.counted["scans"] += 1
+        self._taken += 1
+        if self._taken % self.output.publish_every:
+            return
         if self.feedback.feedback == "replace" and len(batch):
             self._awaited_ns, self._asked_ns = scan.time_ns, self._wall.now().nanoseconds
         self._publish(batch, scan.time_ns)
-        self.counted["scans"] += 1
 
     def _publish(self, batch: TrackBatch, stamp_ns: int) -> None:
         self._tracks.publish(track_table_to_msg(batch, self.tracker.layout.axes, stamp_ns))

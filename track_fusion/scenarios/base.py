@@ -119,6 +119,42 @@ class Scene(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
+class OneTarget:
+    """The Scene of a Tracking: one target, seen by every sensor at every step."""
+
+    tracking: Tracking
+
+    @property
+    def layout(self) -> StateLayout:
+        """Axes of the true states."""
+        return self.tracking.motion.layout
+
+    @property
+    def dt_s(self) -> float:
+        """Sampling interval."""
+        return self.tracking.dt_s
+
+    @property
+    def steps(self) -> int:
+        """Number of filtering steps."""
+        return self.tracking.steps
+
+    @property
+    def sensors(self) -> Mapping[str, Sensor]:
+        """Sensors by name."""
+        return self.tracking.sensors
+
+    def truth(self, seed: int, run: int, steps: int | None = None) -> Array:
+        """Draw the states, (T + 1, 1, n)."""
+        return self.tracking.truth(seed, run, steps)[:, None]
+
+    def detections(self, seed: int, run: int, steps: int | None = None) -> dict[str, list[Array]]:
+        """Draw each sensor's measurements, one a scan, (1, m) each."""
+        drawn = self.tracking.measurements(self.tracking.truth(seed, run, steps), seed, run)
+        return {name: list(z[:, None]) for name, z in drawn.items()}
+
+
+@dataclasses.dataclass(frozen=True)
 class RuleChoice:
     """A rule with the parameters that a scenario gives it, and the name of the variant ("" = the paper's)."""
 
@@ -211,6 +247,23 @@ class Scenario:
     scene: Callable[[], Scene] | None = None
     rules: tuple[RuleChoice, ...] = ()
     compare: Callable[[Sequence[RuleChoice], Sequence[int], int, Progress], Samples] | None = None
+
+    @property
+    def over_ros(self) -> bool:
+        """Whether there is something for the ROS nodes to run."""
+        return self.tracking is not None or self.scene is not None
+
+    def played(self) -> Scene:
+        """Make what the replay node publishes; only where :attr:`over_ros`.
+
+        Raises
+        ------
+        ImportError    a package that the scene is made with is missing
+        """
+        if self.scene is not None:
+            return self.scene()
+        assert self.tracking is not None
+        return OneTarget(self.tracking)
 
     @property
     def random(self) -> bool:
