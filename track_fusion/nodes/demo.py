@@ -8,8 +8,9 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock as ClockMessage
+from sensor_msgs.msg import PointCloud2
 
 from msg_adapters.arrays import merged
 from msg_adapters.odometry import odometry_from_msg
@@ -28,16 +30,26 @@ from track_fusion.nodes.bringup import Bringup, Nodes, bringups, local_environme
 from track_fusion.nodes.managed import Fault, qos
 from track_fusion.nodes.recorder import Recorder, read_bag
 from track_fusion.params import ParameterError, specs, unknown_name_error
-from track_fusion.report.picture import Line, draw
+from track_fusion.report.picture import Line, draw, draw_map
 from track_fusion.rules import get_rule
-from track_fusion.scenarios import SCENARIOS, RuleChoice, Scenario, Tracking, get_scenario, judged_figures
+from track_fusion.scenarios import SCENARIOS, RuleChoice, Scenario, get_scenario, judged_figures
+from track_fusion.scenarios.base import Scene
+from track_fusion.tracks import StateLayout, TrackBatch
 
 #: How a scenario's rows name what the tracker nodes run.
-ROWS = {"kalman": "kf", "extended": "ekf", "unscented": "ukf", "cubature": "ckf", "particle": "sir", "student_t": "stf"}
+ROWS = {
+    "kalman": "kf",
+    "extended": "ekf",
+    "unscented": "ukf",
+    "cubature": "ckf",
+    "particle": "sir",
+    "student_t": "stf",
+    "pda": "pda",
+}
 #: Rules that a scenario which has them all is shown with; the last is recorded and drawn.
 RULES = ("naive", "covariance_intersection", "arithmetic_average")
 #: A run over ROS that takes longer than this has hung.
-RUN_DEADLINE_S = 120.0
+RUN_DEADLINE_S = 300.0
 #: Library runs to compare with where they cost little.
 FAST_RUNS = 1000
 #: Domains that Linux's default range of ephemeral ports leaves free.
@@ -45,9 +57,11 @@ DOMAINS = 101
 TRUTH = "/replay/truth"
 FUSED = "/fusion_centre/tracks"
 TABLE, ODOMETRY = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry"
-COLORS = {"truth": "black", "sensor_1": "tab:blue", "sensor_2": "tab:orange", "fused": "tab:red"}
+#: Of the sensors, and last of what is fused.
+COLORS = ("tab:blue", "tab:orange", "tab:green", "tab:purple", "tab:red")
 
 Progress = Callable[[str, float], None]
+Figures = dict[str, Estimate]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,11 +88,25 @@ class Demo:
     seed: int = 0
     library_runs: int = 1000
 
-    @property
-    def tracking(self) -> Tracking:
+    @cached_property
+    def scene(self) -> Scene:
         """What the nodes run."""
-        assert self.scenario.tracking is not None
-        return self.scenario.tracking
+        return self.scenario.played()
+
+    @cached_property
+    def bringup(self) -> Bringup:
+        """What the parameter file says."""
+        return Bringup(self.name)
+
+    @property
+    def results(self) -> int:
+        """Number of fusions."""
+        return self.scene.steps // self.bringup.result_every
+
+    @property
+    def many_targets(self) -> bool:
+        """Whether the scenario itself judges what the centre publishes."""
+        return self.scenario.judge is not None
 
     def choice(self, rule: str) -> RuleChoice | None:
         """The scenario's own choice of parameters under this name."""
@@ -101,78 +129,97 @@ def run_demo(demo: Demo, progress: Progress) -> dict[str, Any]:
         shutil.rmtree(demo.out)
     demo.out.mkdir(parents=True)
     over_ros: dict[str, dict[str, float]] = {}
-    for rule in (None, *demo.rules):
+    for rule in demo.rules if demo.many_targets else (None, *demo.rules):
         over_ros[rule or "alone"] = _over_ros(demo, rule, progress)
-    rows = [f"{demo.row}-{name}" for name in over_ros]
-    same, label = _library(demo, rows, 1, lambda share: None), f"library, {demo.library_runs} runs"
-    many = _library(demo, rows, demo.library_runs, lambda share: progress(label, share))
-    result = _figures(demo, over_ros, same, many)
+    rows, label = [f"{demo.row}-{name}" for name in over_ros], f"library, {demo.library_runs} runs"
+    result = _figures(demo, over_ros, *_library(demo, rows, lambda share: progress(label, share)))
     (demo.out / "figures.json").write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
     _picture(demo)
     return result
 
 
-def _library(demo: Demo, rows: list[str], runs: int, progress: Callable[[float], None]) -> dict[str, Estimate]:
-    """Measure the rows that the scenario has; it may know nothing of a rule that the user has asked for."""
-    found: dict[str, Estimate] = {}
-    for done, row in enumerate(rows):
+def _library(demo: Demo, rows: list[str], progress: Callable[[float], None]) -> tuple[Figures, Figures]:
+    """Measure the rows that the scenario has, over the first run alone and over all; it may not know every rule.
+
+    Rows of many targets share the tracks, the costly part, and are studied at once.
+    """
+    wanted = [f"{demo.row}-"] if demo.many_targets else rows
+    same: Figures = {}
+    many: Figures = {}
+    for done, only in enumerate(wanted):
 
         def part(share: float, done: int = done) -> None:
-            progress((done + share) / len(rows))
+            progress((done + share) / len(wanted))
 
         try:
-            measured = demo.scenario.study(runs, demo.seed, part, row)
+            samples = demo.scenario.sample(range(demo.library_runs), demo.seed, part, only)
         except ParameterError:
             continue
-        found |= {name: estimate for name, estimate in measured.items() if name.startswith(f"{row}/")}
+        for found, runs in ((same, 1), (many, demo.library_runs)):
+            figures = demo.scenario.figures({name: array[:runs] for name, array in samples.items()})
+            found |= {name: e for name, e in figures.items() if name.rpartition("/")[0] in rows}
     progress(1.0)
-    return found
+    return same, many
 
 
 def _over_ros(demo: Demo, rule: str | None, progress: Progress) -> dict[str, float]:
-    """Run the scenario once by real processes; return the evaluator's figures."""
+    """Run the scenario once by real processes; return its figures."""
     name = rule or "alone"
-    judged = demo.out / f"evaluation_{name}.json"
-    log = demo.out / f"nodes_{name}.log"
+    judged, log = demo.out / f"evaluation_{name}.json", demo.out / f"nodes_{name}.log"
     domain = (os.getpid() + len(name)) % DOMAINS
-    recording = rule == demo.rules[-1]
+    topics = _recorded(demo) if rule == demo.rules[-1] else {}
     with running(local_environment(domain), log) as nodes, _observer(domain) as (node, spin):
-        sensors = list(demo.tracking.sensors)
-        topics = {TRUTH: ODOMETRY, **{f"/{s}/tracks": TABLE for s in sensors}, FUSED: TABLE}
-        topics |= {f"/replay/{s}/detections": TABLE for s in sensors}
-        recorder = Recorder(node, demo.out / "bag", topics) if recording else None
-        seen = _clock_counter(node)
+        recorder = Recorder(node, demo.out / "bag", topics) if topics else None
+        seen, fused = _clock_counter(node), _listener(node) if demo.many_targets else []
         key = rule and rule.partition("@")[0]
-        start_scenario(nodes, demo.name, key, _overrides(demo, rule, sensors, judged, recording))
-        steps = demo.tracking.steps
-        _wait(nodes, log, spin, lambda: progress(f"ROS, {name}", seen() / steps))
+        start_scenario(nodes, demo.name, key, _overrides(demo, rule, judged, topics))
+        _wait(nodes, log, spin, lambda: progress(f"ROS, {name}", seen() / demo.scene.steps))
+        deadline = time.monotonic() + 5.0
+        while time.monotonic() < deadline and (
+            (demo.many_targets and len(fused) < demo.results)
+            or (recorder is not None and min(recorder.counts[t] for t in topics) < demo.results)
+        ):
+            spin()
         if recorder is not None:
-            deadline = time.monotonic() + 5.0
-            while min(recorder.counts[t] for t in topics) < steps and time.monotonic() < deadline:
-                spin()
             recorder.close()
     progress(f"ROS, {name}", 1.0)
     result = json.loads(judged.read_text())
     judged.unlink()
-    if result["times"] != steps or result["missed"]:
-        raise Fault(f"{name}: {result['times']} of {steps} steps were judged, {result['missed']} missed; see {log}.")
-    return {k: v for k, v in result["all"].items() if "armse" in k}
+    if result["times"] != demo.results or (result["missed"] and not demo.many_targets):
+        raise Fault(
+            f"{name}: {result['times']} of {demo.results} steps were judged, {result['missed']} missed; see {log}."
+        )
+    if demo.scenario.judge is None:
+        return {k: v for k, v in result["all"].items() if "armse" in k}
+    row = f"{demo.row}-{name}"
+    figures = demo.scenario.figures(demo.scenario.judge(row, fused))
+    return {name.removeprefix(f"{row}/"): e.value for name, e in figures.items()}
 
 
-def _overrides(
-    demo: Demo, rule: str | None, sensors: list[str], judged: Path, recording: bool
-) -> dict[str, dict[str, Any]]:
-    """Parameters on top of the scenario's file; every output waits for all who read it."""
-    extra = int(recording)
+def _recorded(demo: Demo) -> dict[str, str]:
+    """Topics of the bag and their types; of many targets all but the detections, which are very many."""
+    topics = {TRUTH: ODOMETRY, **{f"/{s}/tracks": TABLE for s in demo.scene.sensors}, FUSED: TABLE}
+    return topics | ({} if demo.many_targets else {f"/replay/{s}/detections": TABLE for s in demo.scene.sensors})
+
+
+def _overrides(demo: Demo, rule: str | None, judged: Path, topics: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+    """Parameters on top of the scenario's file; every output waits for all who read it, the recorder of topics, too."""
+    file, sensors = demo.bringup.sections, list(demo.scene.sensors)
+    readers = {name: file[name]["expected_subscribers"] + (f"/{name}/tracks" in topics) for name in sensors}
     overrides: dict[str, dict[str, Any]] = {
         "evaluator": {"output": str(judged)},
-        "replay": {"seed": demo.seed, "expected_truth_subscribers": 1 + extra, "expected_subscribers_each": 1 + extra},
+        "replay": {
+            "seed": demo.seed,
+            "expected_truth_subscribers": 1 + (TRUTH in topics),
+            "expected_subscribers_each": 1 + (f"/replay/{sensors[0]}/detections" in topics),
+        },
     }
     if rule is None:
         overrides[sensors[0]] = {"expected_subscribers": 2}  # replay and evaluator
         return overrides
-    overrides |= {s: {"expected_subscribers": 1 + extra} for s in sensors}
-    overrides["fusion_centre"] = {"expected_subscribers": 2 + len(sensors) + extra} | _variant(demo, rule)
+    overrides |= {name: {"expected_subscribers": count} for name, count in readers.items()}
+    of_fused = file["fusion_centre"]["expected_subscribers"] + (FUSED in topics) + demo.many_targets
+    overrides["fusion_centre"] = {"expected_subscribers": of_fused} | _variant(demo, rule)
     return overrides
 
 
@@ -213,6 +260,18 @@ def _clock_counter(node: Node) -> Callable[[], int]:
     return lambda: count
 
 
+def _listener(node: Node) -> list[TrackBatch]:
+    """Return the list that grows by each batch of fused tracks."""
+    batches: list[TrackBatch] = []
+
+    def on_tracks(msg: Any) -> None:
+        fields = {name: value for name, value in vars(track_table_from_msg(msg)).items() if name != "axes"}
+        batches.append(TrackBatch(layout=StateLayout(track_table_from_msg(msg).axes), **fields))
+
+    node.create_subscription(PointCloud2, FUSED, on_tracks, qos(1000))
+    return batches
+
+
 def _wait(nodes: Nodes, log: Path, spin: Callable[[], None], report: Callable[[], None]) -> None:
     """Let the run come to its end, or say which node failed."""
     deadline = time.monotonic() + RUN_DEADLINE_S
@@ -227,17 +286,16 @@ def _wait(nodes: Nodes, log: Path, spin: Callable[[], None], report: Callable[[]
         report()
 
 
-def _figures(
-    demo: Demo, over_ros: dict[str, dict[str, float]], same: dict[str, Estimate], many: dict[str, Estimate]
-) -> dict[str, Any]:
+def _figures(demo: Demo, over_ros: dict[str, dict[str, float]], same: Figures, many: Figures) -> dict[str, Any]:
     """Bring all into the form of `reproduce`: ros/ and library/ are the same one run, library/...@N-runs the study.
 
     The standard error of one run is the spread of a run in the study.
     """
     scenario = demo.scenario
     listed: list[dict[str, Any]] = []
+    known = {name.rpartition("/")[2] for name in many}
     for rule, measured in over_ros.items():
-        for quantity in measured:
+        for quantity in [q for q in measured if q in known or not known]:
             name = f"{demo.row}-{rule}/{quantity}"
             spread = many[name].spread(1) if name in many else math.nan
             single = {"ros": measured[quantity]} | ({"library": same[name].value} if name in same else {})
@@ -261,7 +319,7 @@ def _figures(
 
 def _picture(demo: Demo) -> None:
     """Draw what the bag holds."""
-    layout, sensors = demo.tracking.motion.layout, list(demo.tracking.sensors)
+    layout, sensors = demo.scene.layout, list(demo.scene.sensors)
     axes, at = layout.axes, list(layout.position)
     topics = {**{s: f"/{s}/tracks" for s in sensors}, "fused": FUSED}
     messages = read_bag(demo.out / "bag", (TRUTH, *topics.values()))
@@ -269,12 +327,17 @@ def _picture(demo: Demo) -> None:
     lines = []
     for name, topic in topics.items():
         moments = [merged(track_table_from_msg(m), axes) for m in messages[topic]]
-        mean = np.array([m[0, at] for m, _ in moments])
-        cov = np.array([c[0][np.ix_(at, at)] for _, c in moments])
+        mean = np.concatenate([m[:, at] for m, _ in moments])
+        cov = np.concatenate([c[:, at][..., at] for _, c in moments])
         label = f"fused: {demo.rules[-1].replace('_', ' ')}" if name == "fused" else name.replace("_", " ")
-        lines.append(Line(label, COLORS.get(name, "tab:green"), mean, cov))
-    title = f"{demo.scenario.title}: fused over ROS 2 and fed back to the trackers (one run)"
-    draw(demo.out / "tracks.png", title, Line("truth", COLORS["truth"], states), lines)
+        lines.append(Line(label, COLORS[list(topics).index(name) if name != "fused" else -1], mean, cov))
+    truth = Line("truth", "black", states)
+    what = "fused over ROS 2" if demo.many_targets else "fused over ROS 2 and fed back to the trackers"
+    title = f"{demo.scenario.title}: {what} (one run)"
+    if demo.many_targets:
+        draw_map(demo.out / "tracks.png", title, [truth, *lines])
+    else:
+        draw(demo.out / "tracks.png", title, truth, lines)
 
 
 def demo_of(name: str, out: Path, seed: int, library_runs: int | None, rules: tuple[str, ...] = ()) -> Demo:

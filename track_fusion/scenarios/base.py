@@ -17,7 +17,7 @@ from track_fusion.models.noise import Noise
 from track_fusion.params import ParameterError, Params, unknown_name_error
 from track_fusion.report.chart import Chart
 from track_fusion.rules import RULES, FusedTracks, Rule, SourceTracks
-from track_fusion.tracks import StateLayout
+from track_fusion.tracks import StateLayout, TrackBatch
 
 T = TypeVar("T")
 
@@ -224,6 +224,8 @@ class Scenario:
     piece : int                so many runs are worked on at once
     tracking : Tracking | None what the ROS nodes run, one target; None = library only, unless there is a scene
     scene : callable | None    makes the Scene that the ROS nodes run, many targets
+    judge : callable | None    (row, tracks that a centre published, a batch a fusion) -> Samples of one run, named as
+                               those of `sample`; None: one target, whose errors the evaluator node tells
     rules : tuple              the rules it compares, with their parameters
     compare : callable | None  (rules, runs, seed, progress) -> Samples, (R,) each, named as figures are: one number a
                                run for any rules; None = the scenario fuses no tracks
@@ -245,6 +247,7 @@ class Scenario:
     piece: int = 100
     tracking: Tracking | None = None
     scene: Callable[[], Scene] | None = None
+    judge: Callable[[str, Sequence[TrackBatch]], Samples] | None = None
     rules: tuple[RuleChoice, ...] = ()
     compare: Callable[[Sequence[RuleChoice], Sequence[int], int, Progress], Samples] | None = None
 

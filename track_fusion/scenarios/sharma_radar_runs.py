@@ -211,8 +211,16 @@ def _one_run(rows: Mapping[str, RuleChoice | None], seed: int, run: int, progres
         for row, kept in steps.items():
             fuser = centres.get(row)
             kept.append(judged_alone(scans, states) if fuser is None else judged(fuser.step(time_ns, scans)[0], states))
-    return {
-        f"{row}/{column}": np.stack(values)
-        for row, kept in steps.items()
-        for column, values in zip(COLUMNS, zip(*kept, strict=True), strict=True)
-    }
+    return {name: part for row, kept in steps.items() for name, part in _columns(row, kept).items()}
+
+
+def _columns(row: str, kept: Sequence[Judged]) -> dict[str, Array]:
+    """Stack what is kept of each fusion: {row/column: (F, ...)}."""
+    return {f"{row}/{c}": np.stack(values) for c, values in zip(COLUMNS, zip(*kept, strict=True), strict=True)}
+
+
+def judge(row: str, published: Sequence[TrackBatch]) -> Samples:
+    """Judge what a centre published at each fusion, as one run of a row of :func:`tracked`."""
+    truth = scene().truth(0, 0)[FUSION_SCANS::FUSION_SCANS]
+    kept = [judged(tracks.to_axes(LAYOUT), states) for tracks, states in zip(published, truth, strict=True)]
+    return {name: part[None] for name, part in _columns(row, kept).items()}

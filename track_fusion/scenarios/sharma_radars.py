@@ -22,6 +22,7 @@ from track_fusion.scenarios.sharma_radar_runs import (
     REACH_M,
     RULE_CHOICES,
     category,
+    judge,
     scene,
     seen,
     seen_by,
@@ -282,6 +283,7 @@ SCENARIO = Scenario(
     claims=CLAIMS,
     piece=1,
     scene=scene,
+    judge=judge,
     rules=RULE_CHOICES,
     compare=compare,
 )
