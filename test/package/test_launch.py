@@ -57,9 +57,7 @@ def test_replay_trackers_centre_and_evaluator_are_started(recorded: launch_stand
     trackers = dict.fromkeys(bringup.trackers, "sensor_tracker")
     others = {name: name for name in ("fusion_centre", "evaluator", "replay")}
     assert {node.name: node.executable for node in recorded.nodes} == trackers | others
-    tracking = get_scenario(bringup.scenario).tracking
-    assert tracking is not None
-    assert tuple(tracking.sensors) == bringup.trackers
+    assert tuple(get_scenario(bringup.scenario).played().sensors) == bringup.trackers
     assert [node.name for node in recorded.nodes if node.ends_launch] == ["replay"]
 
 

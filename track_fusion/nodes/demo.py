@@ -141,9 +141,10 @@ def run_demo(demo: Demo, progress: Progress) -> dict[str, Any]:
 def _library(demo: Demo, rows: list[str], progress: Callable[[float], None]) -> tuple[Figures, Figures]:
     """Measure the rows that the scenario has, over the first run alone and over all; it may not know every rule.
 
-    Rows of many targets share the tracks, the costly part, and are studied at once.
+    Rows of many targets share the tracks, the costly part, and are studied at once. Of one target, what all sensors
+    together would give (IC) is measured for comparison.
     """
-    wanted = [f"{demo.row}-"] if demo.many_targets else rows
+    wanted = [f"{demo.row}-"] if demo.many_targets else [*rows, f"{demo.row}-ic"]
     same: Figures = {}
     many: Figures = {}
     for done, only in enumerate(wanted):
@@ -156,8 +157,7 @@ def _library(demo: Demo, rows: list[str], progress: Callable[[float], None]) -> 
         except ParameterError:
             continue
         for found, runs in ((same, 1), (many, demo.library_runs)):
-            figures = demo.scenario.figures({name: array[:runs] for name, array in samples.items()})
-            found |= {name: e for name, e in figures.items() if name.rpartition("/")[0] in rows}
+            found |= demo.scenario.figures({name: array[:runs] for name, array in samples.items()})
     progress(1.0)
     return same, many
 
