@@ -331,7 +331,7 @@ SCENARIO = Scenario(
     shows="exact decentralised fusion of mixtures over a star with channel filters, beside the centralised mixture",
     published=FIGURE_9,
     published_runs=1,
-    default_runs=4,
+    default_runs=3,
     publication_runs=20,
     assumptions=(
         "assumed: prior of nine equal components of variance 0.8 m^2 on a 3 x 3 grid of 3 m, each jittered by up to "
