@@ -210,3 +210,19 @@ def test_batch_equals_loop(lead):
         robust = gstm.update(mean[i], cov[i], z[i], sensor)
         np.testing.assert_allclose(mixture[0][i], robust[0], rtol=1e-7, atol=1e-9)
         np.testing.assert_allclose(mixture[1][i], robust[1], rtol=1e-6, atol=1e-9)
+
+
+def test_mixture_update_in_a_batch_equals_it_alone():
+    """Each stops when its own precisions have settled: the share of a gross outlier is zero long before its scale."""
+    sensor = LinearSensor(("a",), np.array([[1.0, 0.0]]), np.eye(1))
+    mean, cov = np.zeros((4, 2)), np.tile(np.array([[2.0, 0.4], [0.4, 1.0]]), (4, 1, 1))
+    z = np.array([[0.1], [7.0], [100.0], [1e4]])
+    together, spread, robust = gstm.update(mean, cov, z, sensor)
+    for i in range(4):
+        alone, alone_cov, one = gstm.update(mean[i], cov[i], z[i], sensor)
+        np.testing.assert_array_equal(alone, together[i])
+        np.testing.assert_array_equal(alone_cov, spread[i])
+        assert one.converged == robust.converged[i]
+        longer = gstm.update(mean[i], cov[i], z[i], sensor, MixtureNoiseParams(max_iterations=10_000, tolerance=0.0))
+        np.testing.assert_allclose(longer[0], alone, rtol=1e-7)
+        np.testing.assert_allclose(longer[1], alone_cov, rtol=1e-7)

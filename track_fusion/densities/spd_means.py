@@ -183,11 +183,12 @@ def _newton_step(logs: Array, vectors: Array, gradient: Array) -> Array:
     length = np.sqrt(square)
     target = (length * np.maximum(INNER_TOLERANCE, np.minimum(0.1, length))) ** 2
     for _ in range(MAX_INNER):
-        if (square <= target).all():
+        open_rows = square > target
+        if not open_rows.any():
             break
         image = hessian(direction)
-        # A solved row has no direction left: it stays.
-        share = square / np.maximum(_dot(direction, image), np.finfo(float).tiny)
+        # A solved row stays as it is, so that no row depends on the others of its batch.
+        share = np.where(open_rows, square / np.maximum(_dot(direction, image), np.finfo(float).tiny), 0.0)
         x = x + share[:, None, None] * direction
         residual = residual - share[:, None, None] * image
         new = _dot(residual, residual)

@@ -281,7 +281,12 @@ class Scenario:
 
 
 def fuse_runs(
-    rule: Rule, params: Params, mean: Array, cov: Array, rngs: Sequence[np.random.Generator] | None = None
+    rule: Rule,
+    params: Params,
+    mean: Array,
+    cov: Array,
+    rngs: Sequence[np.random.Generator] | None = None,
+    dof: float = math.inf,
 ) -> FusedTracks:
     """Fuse the tracks of R runs, covariances that all runs share only once.
 
@@ -290,6 +295,7 @@ def fuse_runs(
     mean : (R, K, n)
     cov : (R, K, n, n), or (1, K, n, n) where all runs have the same
     rngs : one generator a run, or None    for a rule that samples: each run then draws its own numbers
+    dof : float    degrees of freedom of every track
 
     Returns
     -------
@@ -303,7 +309,8 @@ def fuse_runs(
         fused = rule.fuse(SourceTracks(units, np.repeat(cov, len(units), 0)), params)
         weights = None if fused.weights is None else fused.weights[:1]
         return FusedTracks(matvec(transpose(fused.mean), mean.reshape(runs, -1)), fused.cov[:1], weights)
-    tracks = SourceTracks(mean, np.broadcast_to(cov, (runs, count, n, n)))
+    dofs = np.full((runs, count), dof) if math.isfinite(dof) else None
+    tracks = SourceTracks(mean, np.broadcast_to(cov, (runs, count, n, n)), dofs)
     if rngs is None or not rule.uses("seed", params):
         return rule.fuse(tracks, params)
     each = [rule.fuse(_one_run(tracks, r, rng), params) for r, rng in enumerate(rngs)]
@@ -314,7 +321,8 @@ def fuse_runs(
 
 def _one_run(tracks: SourceTracks, run: int, rng: np.random.Generator) -> SourceTracks:
     at = slice(run, run + 1)
-    return SourceTracks(tracks.mean[at], tracks.cov[at], extras={"seed": rng})
+    dof = None if tracks.dof is None else tracks.dof[at]
+    return SourceTracks(tracks.mean[at], tracks.cov[at], dof, extras={"seed": rng})
 
 
 def check_needs(choices: Sequence[RuleChoice], given: Collection[str] = ()) -> None:

@@ -21,15 +21,26 @@ from track_fusion.models.base import Sensor, Transition
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.noise import Noise
+from track_fusion.random_streams import stream
 from track_fusion.report.chart import Chart, Series
-from track_fusion.rules import RULES, FusedTracks, SourceTracks
+from track_fusion.rules import RULES, FusedTracks
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.fast_covariance_intersection import FastCovarianceIntersectionParams
 from track_fusion.rules.geodesic_projection import GeodesicProjectionParams
 from track_fusion.rules.mhdp_explicit import MhdpExplicitParams
 from track_fusion.rules.mhdp_iterative import MhdpIterativeParams
 from track_fusion.rules.quasi_minimal_manhattan import QuasiMinimalManhattanParams
-from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, Scenario, Tracking, check_needs, chosen
+from track_fusion.scenarios.base import (
+    Claim,
+    Progress,
+    RuleChoice,
+    Samples,
+    Scenario,
+    Tracking,
+    check_needs,
+    chosen,
+    fuse_runs,
+)
 from track_fusion.tracks import StateLayout
 
 #: Degrees of freedom of all densities, and covariance over scatter.
@@ -148,11 +159,12 @@ def fusions(base: Tracking, name: str, choice: RuleChoice, seed: int, runs: Sequ
     stacked = {sensor: np.stack([z[sensor] for z in seen], 1) for sensor in met.sensors}
     mean = np.tile(met.initial_mean, (len(runs), 1))
     cov = np.tile(met.initial_cov, (len(runs), 1, 1))
+    rngs = [stream(seed, run, "fusion_centre") for run in runs]
     for k in range(met.steps):
         mean, cov = one.predict(mean, cov, met.motion.over(met.dt_s))
         local = [one.update(mean, cov, stacked[key][k], sensor)[:2] for key, sensor in met.sensors.items()]
         means, covs = (np.stack(parts, 1) for parts in zip(*local, strict=True))
-        fused = RULES[choice.key].fuse(SourceTracks(means, covs, np.full(means.shape[:-1], DOF)), choice.params)
+        fused = fuse_runs(RULES[choice.key], choice.params, means, covs, rngs, DOF)
         mean, cov = fused.mean, fused.cov
         yield fused
 
