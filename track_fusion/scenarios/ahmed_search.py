@@ -345,7 +345,7 @@ SCENARIO = Scenario(
         "robot 3 fuses the messages of robots 1, 2, 4, 5 in this order; the fifty views all come before",
         "divergences are sums over a grid of 160 x 160 cells on +-7 m",
         "pairs of components whose quotient has no integral are left out",
-        "the printed divergence belongs to the prior and ways of Fig. 9, a picture: only its order of magnitude compares",
+        "the printed divergence belongs to the prior and ways of Fig. 9, a picture: its magnitude alone compares",
     ),
     sample=sample,
     figures=figures,
