@@ -33,5 +33,5 @@ SCENARIO = scenario(
     "Heavy-tailed noises: one sensor of the position, one of the velocity",
     TRACKING,
     TABLE_1,
-    runs=50,
+    runs=100,
 )
