@@ -1,4 +1,4 @@
-"""The golden bags through real nodes against an oracle that shares no code with the package (test/data/make_golden.py).
+"""The golden bags through real nodes against oracles that share no code with the package (test/data/make_golden*.py).
 
 One replay process plays the bag of track tables to three centres, one a rule; another one that of Odometry, on a clock
 of its own. What is published is recorded in both storage formats, and both recordings are played again.
@@ -23,7 +23,8 @@ from sensor_msgs.msg import PointCloud2
 
 from track_fusion.nodes.recorder import Recorder
 
-GOLDEN = Path(__file__).resolve().parents[1] / "data" / "golden"
+ROOT = Path(__file__).resolve().parents[2]
+GOLDEN = ROOT / "test" / "data" / "golden"
 RULES = ("naive", "covariance_intersection", "arithmetic_average")
 SOURCES = ("sensor_1", "sensor_2")
 RATE = 10.0  # bag seconds a second: 6 s of bag
@@ -49,9 +50,11 @@ def centre(name: str, oracle: str, prefix: str, topic: str, clock_topic: str) ->
     return NodeProcess("fusion_centre", node=name, params=params, remaps=inputs | {"/clock": clock_topic})
 
 
-def replay(name: str, bag: Path, clock_topic: str, prefix: str = "", readers: int = 1) -> NodeProcess:
+def replay(
+    name: str, bag: Path, clock_topic: str, prefix: str = "", readers: int = 1, rate: float = RATE
+) -> NodeProcess:
     """Start a replay of a bag."""
-    params: dict[str, Any] = {"bag": str(bag), "pace": "realtime", "rate": RATE, "expected_subscribers_each": readers}
+    params: dict[str, Any] = {"bag": str(bag), "pace": "realtime", "rate": rate, "expected_subscribers_each": readers}
     if prefix:
         params["bag_remaps"] = [f"/{s}/tracks:={prefix}/{s}/tracks" for s in SOURCES]
     return NodeProcess("replay", node=name, params=params, remaps={"/clock": clock_topic})
@@ -146,6 +149,33 @@ def test_identities_do_not_switch(fused: Any) -> None:
         assert max(abs(np.diff(path)).max() for path in paths.values()) < 2.5, name
 
 
+@pytest.mark.parametrize("rule", ["arithmetic_average", "covariance_intersection"])
+def test_a_bag_of_detections_gives_the_expected_tracks_through_trackers_with_feedback(
+    rule: str, ros_context: Any, ros_domain: int
+) -> None:
+    """The nonlinear scenario of Li 2022 with its own parameter file: cubature filters, a centre, and back."""
+    file, oracle = ROOT / "config" / "li2022-nonlinear.yaml", f"turn_{rule}"
+    steps = len(expected(oracle)["steps"])
+    patient = {"max_future_s": 1000.0, "feedback_timeout_s": 1000.0, "expected_subscribers": 1}
+    criteria = {"covariance_intersection.criterion": "det", "arithmetic_average.criterion": "diversity"}
+    fusing = {k: v for k, v in PATIENT.items() if k not in ("axes", "use_sim_time")}
+    fusing |= {"state_fusion": rule, "expected_subscribers": 3, **criteria, **deep("/fusion_centre/tracks.publisher")}
+    with ExitStack() as stack:
+        probe = stack.enter_context(Probe(ros_context))
+        tables = probe.listen("/fusion_centre/tracks", PointCloud2, 1000)
+        for sensor in SOURCES:
+            params = patient | deep(f"/{sensor}/detections.subscription")
+            remaps = {"~/detections": f"/{sensor}/detections", "~/feedback": "/fusion_centre/tracks"}
+            tracker = NodeProcess("sensor_tracker", node=sensor, params=params, params_file=file, remaps=remaps)
+            stack.enter_context(tracker)
+        inputs = {f"~/sources/{s}/tracks": f"/{s}/tracks" for s in SOURCES}
+        stack.enter_context(NodeProcess("fusion_centre", params=fusing, params_file=file, remaps=inputs))
+        player = stack.enter_context(replay("replay_turn", GOLDEN / "turn", "/clock", rate=20.0))
+        probe.wait_for(lambda: len(tables) >= steps, START_S, "the fused tracks of every step")
+        assert player.wait(STEP_S) == 0
+    compare(tables, oracle)
+
+
 def test_the_golden_bags_are_small() -> None:
-    for bag in ("tracks", "odometry"):
+    for bag in ("tracks", "odometry", "turn"):
         assert sum(p.stat().st_size for p in (GOLDEN / bag).iterdir()) < MAX_BAG_BYTES
