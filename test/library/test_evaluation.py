@@ -145,3 +145,16 @@ def test_the_result_is_json():
     for judge in (evaluation(), judged(1.0, 3)):
         text = json.dumps(judge.result(), allow_nan=False)
         assert json.loads(text) == judge.result()
+
+
+def test_turn_rates_are_judged_in_degrees_a_second():
+    layout = StateLayout(("x", "y", "vx", "vy", "turn_rate"))
+    judge = Evaluation(layout, EvaluationParams())
+    for stamp, error in ((1, 0.03), (2, -0.01)):
+        truth = TrackBatch.gaussian(layout, "map", np.zeros((1, 5)), np.eye(5)[None], time_ns=stamp)
+        judge.add_truth(truth)
+        judge.add_tracks(stamp, truth.replace(mean=truth.mean + [0, 0, 0, 0, error]))
+    figures = judge.result()["all"]
+    assert figures["turn_rate_armse_degps"] == pytest.approx(np.degrees(0.02))
+    assert figures["turn_rate_rmse_degps"] == pytest.approx(np.degrees(np.sqrt((0.03**2 + 0.01**2) / 2)))
+    assert "turn_rate_armse_degps" not in evaluation().result()["all"]

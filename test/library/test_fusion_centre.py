@@ -10,7 +10,9 @@ from scipy.stats import chi2
 from track_fusion.filters.kalman import predict, update
 from track_fusion.fusion_centre import FusionCentre, FusionCentreParams
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
+from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
 from track_fusion.params import ParameterError
+from track_fusion.random_streams import RandomParams, stream
 from track_fusion.rules import RULES, SourceTracks
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.track_manager import TrackManagerParams
@@ -552,3 +554,105 @@ def test_conservative_rules_stay_below_the_nees_bound_that_naive_fusion_exceeds(
 def test_a_rule_that_needs_more_than_tracks_is_refused_at_the_start(key: str) -> None:
     with pytest.raises(ParameterError, match=f"must be a rule that needs only tracks. Got '{key}'"):
         centre(rule=key)
+
+
+# ---- one known target, particles, other motions, rules that draw -----------------------------------------------------
+
+
+def test_a_single_target_needs_no_gate():
+    """Tracks far apart are one target's all the same; of a source only the first row counts."""
+    own = centre(rule="naive", association="single_target")
+    far = {0: tracks([(0, 0)], SECOND, track_id=[3]), 1: tracks([(500, 0), (0, 0)], SECOND)}
+    fused, info = own.step(SECOND, far)
+    assert fused.track_id.tolist() == [1]
+    np.testing.assert_allclose(fused.mean[0, 0, :2], [250.0, 0.0])
+    assert info.members.tolist() == [1, 1]
+    fused, _ = own.step(2 * SECOND, {0: tracks([(9000, 0)], 2 * SECOND)})
+    assert (fused.track_id.tolist(), fused.source.tolist()) == ([1], [1])
+    np.testing.assert_allclose(fused.mean[0, 0, :2], [9000.0, 0.0])
+    assert len(own.step(3 * SECOND, {0: tracks([], 3 * SECOND)})[0]) == 1  # it coasts
+
+
+def test_a_single_target_is_not_started_by_an_old_scan():
+    """Its track dies of misses while the other source's last scan, still young enough, would start it again."""
+    manager = TrackManagerParams(confirmation_threshold=(1, 1), max_coast_s=0.5)
+    own = centre(association="single_target", max_scan_age_s=0.2, manager=manager)
+    own.step(SECOND, {0: tracks([(0, 0)], SECOND)})
+    assert len(own.step(2 * SECOND, {1: tracks([], 2 * SECOND)})[0]) == 0
+    own = centre(association="single_target", max_scan_age_s=100.0, manager=manager)
+    own.step(SECOND, {0: tracks([(0, 0)], SECOND)})
+    assert len(own.step(2 * SECOND, {1: tracks([], 2 * SECOND)})[0]) == 1  # an old scan still supports it
+
+
+def cloud(rng, time_ns, count=40, shift=0.0):
+    points = np.array([10.0, 0.0, 1.0, 0.0]) + shift + rng.normal(size=(1, count, 4))
+    weight = rng.random((1, count))
+    batch = TrackBatch.gaussian(LAYOUT, "map", points[:, 0], np.eye(4)[None], time_ns=time_ns)
+    return batch.replace(mean=points, weight=weight / weight.sum(), cov=np.zeros((1, count, 4, 4)))
+
+
+def test_particles_are_fused_by_their_gaussians_or_joined():
+    rng = np.random.default_rng(5)
+    scans = {k: cloud(rng, SECOND, shift=k) for k in range(2)}
+    floor = (1e-3, 2e-3, 3e-3, 4e-3)
+    moments = [np.average(s.mean[0], axis=0, weights=s.weight[0]) for s in scans.values()]
+    covs = [np.cov(s.mean[0].T, aweights=s.weight[0], ddof=0) + np.diag(floor) for s in scans.values()]
+    plain = RULES["naive"](SourceTracks(np.array(moments), np.array(covs)))
+    fused, _ = centre(rule="naive", particle_variances=floor).step(SECOND, scans)
+    np.testing.assert_allclose(fused.mean[0, 0], plain.mean, rtol=1e-12)
+    np.testing.assert_allclose(fused.cov[0, 0], plain.cov, rtol=1e-10)
+    joined = ArithmeticAverageParams(output="mixture")
+    fused, _ = centre(rule="arithmetic_average", rule_params=joined, particle_variances=floor).step(SECOND, scans)
+    weights = RULES["arithmetic_average"](SourceTracks(np.array(moments), np.array(covs)), joined).weights
+    np.testing.assert_allclose(fused.weight[0], np.concatenate([w * s.weight[0] for w, s in zip(
+        weights, scans.values(), strict=True)]))  # fmt: skip
+    np.testing.assert_array_equal(fused.mean[0], np.concatenate([s.mean[0] for s in scans.values()]))
+    assert not fused.cov.any()
+
+
+def test_particles_of_an_earlier_scan_are_predicted_with_process_noise():
+    rng, own = np.random.default_rng(6), centre(sources=1, max_scan_age_s=10.0, motion=MotionParams(process_noise=4.0))
+    scan = cloud(rng, SECOND)
+    fused, _ = own.step(3 * SECOND, {0: scan})
+    transition, noise = NearlyConstantVelocity(LAYOUT, MotionParams(process_noise=4.0)).matrices(2.0)
+    np.testing.assert_allclose(fused.mean[0], scan.mean[0] @ transition.T)
+    np.testing.assert_allclose(fused.cov[0], np.tile(noise, (40, 1, 1)))
+
+
+def test_a_turning_target_is_predicted_along_its_turn():
+    layout = StateLayout(("x", "y", "vx", "vy", "turn_rate"))
+    motion = CoordinatedTurn(layout, CoordinatedTurnParams(process_noise=0.1, turn_rate_noise=1e-6))
+    params = FusionCentreParams(state_fusion="naive", max_scan_age_s=10.0)
+    own = FusionCentre(1, motion, "map", params, manager_params=EAGER)
+    state = np.array([[0.0, 0.0, 10.0, 0.0, np.pi / 8]])
+    scan = TrackBatch.gaussian(layout, "map", state, 1e-4 * np.eye(5)[None], time_ns=SECOND)
+    fused, _ = own.step(5 * SECOND, {0: scan})
+    radius = 10.0 / (np.pi / 8)
+    np.testing.assert_allclose(fused.mean[0, 0], [radius, radius, 0.0, 10.0, np.pi / 8], atol=1e-9)
+    transition = motion.over(4.0)
+    slope = transition.jacobian(state[0])
+    np.testing.assert_allclose(fused.cov[0, 0], 1e-4 * slope @ slope.T + transition.noise, rtol=1e-10)
+
+
+def test_a_rule_that_samples_goes_on_in_its_stream_and_begins_anew_after_reset():
+    random = RandomParams(seed=4, run=2, role="centre")
+    params = FusionCentreParams(state_fusion="geometric_mean_sampling")
+    motion = NearlyConstantVelocity(LAYOUT, MotionParams())
+    own = FusionCentre(2, motion, "map", params, manager_params=EAGER, random=random)
+    rng, rule, found = stream(4, 2, "centre"), RULES["geometric_mean_sampling"], []
+    for k in (1, 2):
+        scans = {0: tracks([(0, 0)], k * SECOND), 1: tracks([(1, 0)], k * SECOND, 3 * COV)}
+        fused, _ = own.step(k * SECOND, scans)
+        means, covs = (np.stack([getattr(s, name)[:, 0] for s in scans.values()], 1) for name in ("mean", "cov"))
+        plain = rule.fuse(SourceTracks(means, covs, extras={"seed": rng}), rule.params())
+        np.testing.assert_allclose(fused.mean[:, 0], plain.mean, rtol=1e-12)
+        found.append(fused.mean.copy())
+    assert (found[0] != found[1]).any()
+    own.reset()
+    again, _ = own.step(SECOND, {0: tracks([(0, 0)], SECOND), 1: tracks([(1, 0)], SECOND, 3 * COV)})
+    np.testing.assert_array_equal(again.mean, found[0])
+
+
+def test_particle_variances_must_fit_the_axes():
+    with pytest.raises(ParameterError, match="must hold 4 numbers, one an axis, or none. Got 1"):
+        centre(particle_variances=(1.0,))

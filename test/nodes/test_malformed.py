@@ -7,6 +7,7 @@ library makes of the good part alone. The counts on /diagnostics are compared on
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
@@ -33,7 +34,8 @@ from ros_helpers import NodeProcess, Probe
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
-from msg_adapters.detection_table import detection_table_from_msg
+from msg_adapters.arrays import DetectionArrays
+from msg_adapters.detection_table import detection_table_from_msg, detection_table_to_msg
 from msg_adapters.header import stamp_from_ns
 from msg_adapters.odometry import odometry_from_msg, odometry_to_msgs
 from msg_adapters.track_table import track_table_to_msg
@@ -365,7 +367,10 @@ def test_a_tracker_counts_bad_detections_and_tracks_on(bench: Bench) -> None:
     kalman = TRACK_FILTERS["kalman"].make(MOTION, SENSOR, Params())
     tracker = SensorTracker(MOTION, SENSOR, kalman, "map", SensorTrackerParams())
     base_ns, value = bench.now_ns + SECOND_NS, np.array([[3.0, 4.0]])
-    rows: Mapping[str, Any] = {"not_finite": [[NAN, 0.0], [3.0, 4.0]]}
+    rows: Mapping[str, Any] = {
+        "not_finite": [[NAN, 0.0], [3.0, 4.0]],
+        "absurd_value": [[3.0, 4.0], [1e300, 0.0]],
+    }
     whole: list[tuple[str, Callable[[Any], None]]] = [
         *CLOUD_CASES,
         ("missing_field", without_field("x")),
@@ -455,3 +460,49 @@ def test_ten_thousand_tracks_of_each_source_are_fused(bench: Bench, load: Callab
     assert again.track_id.tolist() == arrays.track_id.tolist()
     assert load(GOOD[:0], GOOD[:0], "a miss of all").width == LOAD
     assert bench.diagnostics.rejected("load") == {}
+
+
+# ---- other trackers ----------------------------------------------------------------------------------------------
+
+
+def test_trackers_of_other_sensors_and_filters_count_bad_detections_and_track_on(
+    ros_context: Any, ros_domain: int
+) -> None:
+    """Each scan holds one good detection beside the bad ones: the track is the one of the good ones alone."""
+    axes = ["x", "y", "vx", "vy", "turn_rate"]
+    radar = {"sensor": "range_bearing", "range_sd": 1.0, "bearing_sd": 0.01, "subscribers_deadline_s": START_S}
+    initial = {"initial_mean": [3.0, 4.0, 0.0, 0.0, 0.1], "initial_cov": [1.0, 1.0, 1.0, 1.0, 0.01]}
+    turning = {"axes": axes, "motion": "coordinated_turn", **initial}
+    given = {"cubature": turning, "particle": turning | {"particles": 50}, "pda": {"axes": list(AXES)}}
+    good = np.array([[5.0, 0.9]])
+    bad = [[NAN, 0.0], [5.0, math.inf], [-5.0, 0.9], [1e300, 0.9]]
+    with ExitStack() as stack:
+        probe = stack.enter_context(Probe(ros_context))
+        diagnostics, outputs = Diagnostics(probe), {}
+        for name, params in given.items():
+            clean = f"{name}_clean"
+            for node in (name, clean):
+                chosen = {"use_sim_time": True, "filter": name, "expected_subscribers": 1, "role": "a"} | radar | params
+                if name != "particle":
+                    del chosen["role"]
+                stack.enter_context(NodeProcess("sensor_tracker", node=node, params=chosen))
+                outputs[node] = probe.listen(f"/{node}/tracks", PointCloud2)
+        inputs = {node: probe.publisher(f"/{node}/detections", PointCloud2, deadline_s=START_S) for node in outputs}
+        ticker = probe.publisher("/clock", Clock, readers=len(outputs), deadline_s=START_S)
+        for k in range(1, 6):
+            stamp = FIRST_NS + k * PERIOD_NS
+            for node, publisher in inputs.items():
+                values = good if node.endswith("_clean") else np.concatenate([bad[:2], good, bad[2:]])
+                scan = DetectionArrays(("range", "bearing"), "map", stamp, values, None)
+                publisher.publish(detection_table_to_msg(scan))
+
+            def answered(count: int = k, stamp: int = stamp) -> bool:
+                ticker.publish(clock(stamp))
+                return all(len(messages) >= count for messages in outputs.values())
+
+            probe.wait_for(answered, STEP_S, f"scan {k}")
+        for name in given:
+            assert [m.data for m in outputs[name]] == [m.data for m in outputs[f"{name}_clean"]]
+            diagnostics.wait_for_counts(name, {"absurd_value": 5, "negative_range": 5, "not_finite": 10})
+        assert outputs["cubature"][-1].width == 1
+        assert outputs["particle"][-1].width == 50

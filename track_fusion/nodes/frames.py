@@ -6,11 +6,12 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msg_adapters.arrays import DetectionArrays, MessageError, TrackArrays
 from track_fusion.linalg import Array, is_positive_definite, symmetrise
 from track_fusion.params import Params, param
-from track_fusion.tracks import StateLayout, TrackBatch
+from track_fusion.tracks import ABSURD, StateLayout, TrackBatch
 
 if TYPE_CHECKING:
     from track_fusion.nodes.managed import ManagedNode
@@ -54,14 +55,25 @@ def screened_tracks(node: ManagedNode, arrays: TrackArrays, layout: StateLayout)
 
 
 def screened_detections(node: ManagedNode, scan: DetectionArrays) -> tuple[Array, Array | None]:
-    """Return the usable detections, (D, m) and (D, m, m) or None; bad ones are left out and counted."""
-    good = np.isfinite(scan.value).all(1)
-    if scan.cov is None:
-        node.reject({"not_finite": int((~good).sum())})
+    """Return the usable detections, (D, m) and (D, m, m) or None; bad ones are left out and counted by reason."""
+    good, cov = np.ones(len(scan.value), bool), scan.cov
+    for reason, bad in _bad_detections(scan).items():
+        node.reject({reason: int((bad & good).sum())})
+        good &= ~bad
+    if cov is None:
         return scan.value[good], None
-    good &= np.isfinite(scan.cov).all((1, 2))
-    node.reject({"not_finite": int((~good).sum())})
-    value, cov = scan.value[good], symmetrise(scan.cov[good])
+    value, cov = scan.value[good], symmetrise(cov[good])
     definite = is_positive_definite(cov)
     node.reject({"not_positive_definite": int((~definite).sum())})
     return value[definite], cov[definite]
+
+
+def _bad_detections(scan: DetectionArrays) -> dict[str, NDArray[np.bool_]]:
+    """Tell by reason which detections are bad, in the order in which reasons are reported."""
+    finite = np.asarray(np.isfinite(scan.value).all(1))
+    size = np.zeros(len(finite)) if scan.cov is None else np.sqrt(np.abs(scan.cov).max((1, 2), initial=0.0))
+    finite &= np.isfinite(size)
+    found = {"not_finite": ~finite, "absurd_value": (np.abs(scan.value).max(1, initial=0.0) > ABSURD) | (size > ABSURD)}
+    if "range" in scan.axes:
+        found["negative_range"] = scan.value[:, scan.axes.index("range")] < 0.0
+    return found
