@@ -170,7 +170,7 @@ SCENARIO = Scenario(
     shows="cubature and particle filters under fusion with feedback; how naive fusion loses the target",
     published=published(TABLE_2, QUANTITIES) | SECTION_4B,
     published_runs=100,
-    default_runs=100,
+    default_runs=80,
     publication_runs=1000,
     assumptions=(
         *ASSUMPTIONS,
