@@ -263,21 +263,20 @@ def test_order_of_case_2(errors: dict[str, Samples]) -> None:
     assert max(found[MHDP_E], found[MHDP_I]) <= 0.8 * found[KLA]
 
 
-def test_excess_is_the_difference_of_two_errors_over_the_same_runs(errors: dict[str, Samples]) -> None:
-    """Value from the two figures; standard error below that of independent runs, and by the bootstrap of runs."""
-    squares, rng = errors["II"], np.random.default_rng(0)
-    measured = dynamic.figures(squares)
-    gap, own, reference = (
-        measured[f"stf-{name}"] for name in (f"{QMMHD}/{dynamic.EXCESS}", f"{QMMHD}/{dynamic.FIGURE}",
-                                             f"{MHDP_E}/{dynamic.FIGURE}")
-    )  # fmt: skip
-    assert gap.value == pytest.approx(own.value - reference.value, rel=1e-12)
-    drawn = []
-    for _ in range(400):
-        rows = rng.integers(RUNS, size=RUNS)
-        a, b = (np.sqrt(squares[f"stf-{name}"][rows].mean(0)).mean() for name in (QMMHD, MHDP_E))
-        drawn.append(a - b)
-    assert gap.standard_error == pytest.approx(np.std(drawn), rel=0.3)
+def test_excess_has_the_spread_of_paired_studies() -> None:
+    """Errors that share most of their noise: the standard error is the spread over studies, not that of two rows."""
+    rng, studies, runs = np.random.default_rng(0), 300, 100
+    shared = rng.normal(size=(studies, runs, 4))
+    noise = shared + 0.3 * rng.normal(size=(2, studies, runs, 4))
+    found = [
+        dynamic.figures({f"stf-{MHDP_E}": first**2, f"stf-{GP}": (1.2 * second) ** 2})
+        for first, second in zip(*noise, strict=True)
+    ]
+    gaps = [figures[f"stf-{GP}/{dynamic.EXCESS}"] for figures in found]
+    assert np.mean([gap.value for gap in gaps]) == pytest.approx(0.2 * math.sqrt(1.09), abs=0.01)
+    spread = np.std([gap.value for gap in gaps])
+    assert np.mean([gap.standard_error for gap in gaps]) == pytest.approx(spread, rel=0.15)
+    assert spread < 0.6 * np.mean([figures[f"stf-{GP}/{dynamic.FIGURE}"].standard_error for figures in found])
 
 
 def test_claims_of_case_2_hold_with_the_student_t_filter(errors: dict[str, Samples]) -> None:
