@@ -16,7 +16,6 @@ from track_fusion.linalg import Array
 from track_fusion.models.base import Motion, Sensor, Transition
 from track_fusion.models.choices import Choice
 from track_fusion.models.measurement import LinearSensor
-from track_fusion.models.turn import CoordinatedTurn
 from track_fusion.params import ParameterError, Params, param
 from track_fusion.random_streams import RandomParams
 from track_fusion.tracks import TrackBatch
@@ -136,7 +135,7 @@ def _plain(condition: Callable[..., tuple[Array, Array, object]]) -> GaussianUpd
 
 
 def _kalman(motion: Motion, sensor: Sensor, params: Params) -> TrackFilter:
-    if isinstance(motion, CoordinatedTurn) or not isinstance(sensor, LinearSensor):
+    if motion.over(0.0).matrix is None or not isinstance(sensor, LinearSensor):
         raise ParameterError(
             "The 'filter' parameter must be one for non-linear models, such as extended, unscented or cubature, with "
             "this motion or sensor. Got 'kalman'."

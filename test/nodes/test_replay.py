@@ -161,3 +161,12 @@ def test_a_replay_that_cannot_start_says_why_on_one_line(ros_domain: int) -> Non
             assert process.wait(START_S) == code, (params, process.output())
             (line,) = process.output().strip().splitlines()
             assert wanted in line
+
+
+def test_a_scenario_whose_package_is_missing_says_which_on_one_line(ros_domain: int) -> None:
+    script = "import sys; sys.modules['pymap3d'] = None\nfrom track_fusion.nodes.replay import main\nmain()"
+    command = ["-c", script, "--ros-args", "-p", "scenario:=sharma-radars"]
+    with NodeProcess("replay", command=command) as process:
+        assert process.wait(START_S) == 1
+        (line,) = process.output().strip().splitlines()
+        assert "pip install pymap3d" in line

@@ -21,7 +21,7 @@ def predict(mean: Array, cov: Array, transition: Transition) -> tuple[Array, Arr
     -------
     mean (..., n), cov (..., n, n)
     """
-    slope = transition.jacobian(mean)
+    slope = transition.jacobian(mean) if transition.matrix is None else transition.matrix
     return transition.advance(mean), symmetrise(slope @ cov @ transpose(slope) + transition.noise)
 
 

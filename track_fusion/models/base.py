@@ -22,12 +22,14 @@ class Transition:
     jacobian : (..., n) -> (..., n, n)    its derivative
     noise : (n, n)                        Q
     noise_factor : (n, r)                 G with G G' = Q: what a simulation draws through
+    matrix : (n, n) or None               F of a linear motion, f(x) = F x
     """
 
     advance: Callable[[Array], Array]
     jacobian: Callable[[Array], Array]
     noise: Array
     noise_factor: Array
+    matrix: Array | None = None
 
     @classmethod
     def linear(cls, matrix: Array, noise: Array, noise_factor: Array | None = None) -> Transition:
@@ -40,6 +42,7 @@ class Transition:
             lambda x: np.broadcast_to(matrix, (*x.shape[:-1], *matrix.shape)),
             noise,
             noise_factor,
+            matrix,
         )
 
 

@@ -102,7 +102,10 @@ class ReplayNode(ManagedNode):
         self._started = False
 
     def _connect_scenario(self) -> None:
-        self._scene = get_scenario(self.params.scenario).played()
+        try:
+            self._scene = get_scenario(self.params.scenario).played()
+        except ImportError as error:
+            raise Fault(str(error)) from None
         names = self.params.sensors or tuple(self._scene.sensors)
         for name in names:
             if name not in self._scene.sensors:
