@@ -217,7 +217,7 @@ def test_the_table_shows_error_published_and_verdict(files: Coin) -> None:
     assert ["kf-alone", "1.000 ± 0.010", "1.01", "agrees"] in rows
     assert ["kf-ic", "9.000 ± 0.010", "0.5", "does not reproduce"] in rows
     assert ["kf-naive", "2", "not given"] in rows
-    assert ["naive lies between (1, 2, 9)", "agrees"] in rows
+    assert ["naive lies between (error / m: kf-alone 1, kf-naive 2, kf-ic 9)", "agrees"] in rows
     assert "30, seed 0" in result.stdout
     assert re.search(r"Assumed +it is fair", result.stdout)
 

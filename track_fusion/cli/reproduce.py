@@ -130,6 +130,7 @@ def _print_tables(scenario: Scenario, result: dict[str, Any], took_s: float) -> 
     from rich.markup import escape
 
     from track_fusion.cli.output import console, grid, table
+    from track_fusion.report.page import evidence_text
 
     out = console()
     out.print(f"[bold]{escape(scenario.key)}[/bold]  {escape(scenario.title)}")
@@ -139,8 +140,9 @@ def _print_tables(scenario: Scenario, result: dict[str, Any], took_s: float) -> 
     if result["claims"]:
         claims = table("claim", "verdict", title="claims")
         for c in result["claims"]:
-            evidence = ", ".join(f"{value:.4g}" for value in c["evidence"].values())
-            claims.add_row(escape(f"{c['claim']} ({evidence})"), f"[{STYLES[c['verdict']]}]{c['verdict']}[/]")
+            claims.add_row(
+                escape(f"{c['claim']} ({evidence_text(c['evidence'])})"), f"[{STYLES[c['verdict']]}]{c['verdict']}[/]"
+            )
         out.print("", claims)
     out.print()
     facts = [

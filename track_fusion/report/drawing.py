@@ -16,7 +16,7 @@ LINE_STYLES = {"line": "-", "dashed": "--", "dotted": ":", "steps": "-"}
 #: More lines than this have their legend below the panel.
 LEGEND_INSIDE = 5
 #: Longer labels, in characters, take a row of the legend each.
-LABEL_OF_HALF_WIDTH = 30
+LABEL_OF_HALF_WIDTH = 34
 
 
 def svg(chart: Chart) -> str:

@@ -18,6 +18,8 @@ VERDICTS = ("agrees", "ordering only", "does not reproduce", "not given")
 UNITS = {"mps": "m/s", "degps": "deg/s", "m2": "m²", "m4": "m⁴", "k": "K", "k2": "K²"}
 #: Tables without published figures that are longer than this are folded.
 FOLDED_ABOVE = 8
+#: A claim that more figures decide shows them when asked.
+EVIDENCE_SHOWN = 6
 
 STYLE = """
 :root { font: 16px/1.5 system-ui, sans-serif; color: #1c2733; background: #fff; }
@@ -122,9 +124,9 @@ def _section(section: Section) -> str:
         f"<h2 id='{escape(scenario.key)}'>{escape(scenario.key)}: {escape(scenario.title)}</h2>",
         f"<p>{escape(_sentence(scenario.shows))}</p><p class='quiet'>{escape(scenario.paper)}.</p>",
         f"<p class='quiet'>{runs}; {took_s:.1f} s of one processor.</p>",
-        _claims(result["claims"]),
         _tables(result["figures"]),
         _charts(charts),
+        _claims(result["claims"]),
         "<h3>Assumed, where the paper is silent</h3>",
         f"<ul>{assumed}</ul>" if assumed else "<p>Nothing.</p>",
     ]
@@ -139,8 +141,7 @@ def _claims(claims: Sequence[Mapping[str, Any]]) -> str:
     if not claims:
         return ""
     rows = [
-        f"<tr><td>{escape(c['claim'])}<br><span class='quiet'>{escape(c['source'])}; "
-        f"{_breakable(', '.join(f'{n}: {v:.4g}' for n, v in c['evidence'].items()))}</span></td>"
+        f"<tr><td>{escape(c['claim'])}<div class='quiet'>{escape(c['source'])}; {_evidence(c['evidence'])}</div></td>"
         f"<td class='{_class(c['verdict'])}'>{escape(c['verdict'])}</td></tr>"
         for c in claims
     ]
@@ -148,13 +149,42 @@ def _claims(claims: Sequence[Mapping[str, Any]]) -> str:
     return f"<h3>Claims</h3><div class='scroll'><table>{head}{''.join(rows)}</table></div>"
 
 
+def evidence_text(evidence: Mapping[str, float]) -> str:
+    """Write the figures that decide a claim, those of one quantity together."""
+    groups: dict[str, list[str]] = {}
+    for name, value in evidence.items():
+        row, _, quantity = name.rpartition("/")
+        groups.setdefault(quantity, []).append(f"{row} {value:.4g}")
+    return "; ".join(f"{quantity_text(quantity)}: {', '.join(rows)}" for quantity, rows in groups.items())
+
+
+def _evidence(evidence: Mapping[str, float]) -> str:
+    """Fold the evidence where it is long."""
+    text = _breakable(evidence_text(evidence))
+    if len(evidence) <= EVIDENCE_SHOWN:
+        return text
+    return f"<details><summary>{len(evidence)} figures</summary>{text}</details>"
+
+
 def _tables(figures: Sequence[Mapping[str, Any]]) -> str:
-    """Write a table a quantity; long ones with nothing to compare are folded."""
+    """Write a table a quantity; long ones with nothing to compare are folded, and come last."""
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for figure in figures:
         groups.setdefault(figure["name"].rpartition("/")[2], []).append(figure)
-    tables = "".join(_table(quantity, rows) for quantity, rows in groups.items())
-    return f"<h3>Figures</h3><div class='tables'>{tables}</div>"
+    tables = {q: _table(q, rows) for q, rows in groups.items()}
+    folded = {q for q, rows in groups.items() if len(rows) > FOLDED_ABOVE and not any(map(_published, rows))}
+    shown = "".join(table for q, table in tables.items() if q not in folded)
+    hidden = "".join(
+        f"<details><summary>{escape(quantity_text(q))}: {len(groups[q])} rows, nothing published</summary>"
+        f"{tables[q]}</details>"
+        for q in tables
+        if q in folded
+    )
+    return f"<h3>Figures</h3><div class='tables'>{shown}</div>{hidden}"
+
+
+def _published(figure: Mapping[str, Any]) -> bool:
+    return figure["published"] is not None
 
 
 def _table(quantity: str, rows: Sequence[Mapping[str, Any]]) -> str:
@@ -166,14 +196,11 @@ def _table(quantity: str, rows: Sequence[Mapping[str, Any]]) -> str:
         f"<td class='{_class(f['verdict'])}'>{escape(f['verdict'])}</td></tr>"
         for f in rows
     )
-    table = (
+    return (
         f"<div class='scroll'><table class='figures'><caption>{escape(title)}</caption>"
         "<tr><th class='name'>row</th><th class='number'>measured</th>"
         f"<th class='number'>published</th><th>verdict</th></tr>{body}</table></div>"
     )
-    if len(rows) <= FOLDED_ABOVE or any(f["published"] is not None for f in rows):
-        return table
-    return f"<details><summary>{escape(title)}: {len(rows)} rows, nothing published</summary>{table}</details>"
 
 
 def quantity_text(quantity: str) -> str:
