@@ -271,7 +271,7 @@ class FusionCentre:
         first = pool.tracks[at[:, 0]].replace(source=np.bitwise_or.reduce(bit, axis=1), existence=existence)
         if at.shape[1] == 1:
             return first, 0
-        fused = self.rule.fuse(pool.gather(at, self._extras), self._rule_params)
+        fused = self.rule.fuse(pool.gather(at, self._extras, self.rule.takes_particles), self._rule_params)
         unconverged = int(np.count_nonzero(~np.asarray(fused.info.get("converged", True))))
         weight, mean, cov = _components(fused)
         dof = np.full(len(at), np.inf) if fused.dof is None else fused.dof
@@ -288,6 +288,7 @@ class _Pool:
     mean, cov              moments of each, (P + T, n) and (P + T, n, n), fit to be inverted
     source, stamp_ns       source and own stamp of each source track, (P,)
     bit                    provenance that each brings to a fusion, (P + T,): its source's bit, none for a central one
+    particles              which came as particles, (P + T,); predicted over a time they have covariances
     """
 
     tracks: TrackBatch
@@ -296,6 +297,7 @@ class _Pool:
     source: Rows
     stamp_ns: NDArray[np.int64]
     bit: NDArray[np.uint32]
+    particles: Bools
 
     @classmethod
     def of(
@@ -304,32 +306,55 @@ class _Pool:
         batches = [*scans.values(), central]
         tracks = TrackBatch.concatenate([predicted_to(b, time_ns, motion) for b in batches])
         mean, cov = tracks.moments
-        if tracks.components > 1:
-            particles = np.logical_not(tracks.cov.any((1, 2, 3)))
-            cov = np.where(particles[:, None, None], cov + floor, cov)
-        sound = conditioned(cov)
         if tracks.components == 1:
+            particles, sound = np.zeros(len(tracks), bool), conditioned(cov)
             tracks = tracks.replace(cov=sound[:, None])
+        else:
+            particles, bare = np.concatenate([_bare(b) for b in batches]), _bare(tracks)
+            sound = conditioned(np.where(bare[:, None, None], cov + floor, cov))
+            tracks = tracks.replace(cov=_conditioned_components(tracks.cov, ~bare))
         source = np.repeat(np.fromiter(scans, np.intp), [len(s) for s in scans.values()])
         stamp_ns = np.concatenate([b.time_ns for b in batches])[: len(source)]
         bit = np.zeros(len(tracks), np.uint32)
         bit[: len(source)] = np.left_shift(np.uint32(1), source.astype(np.uint32))
-        return cls(tracks, mean, sound, source, stamp_ns, bit)
+        return cls(tracks, mean, sound, source, stamp_ns, bit, particles)
 
     def split(self) -> tuple[Array, Array, Array, Array]:
         """Moments of the source tracks, then of the central ones."""
         count = len(self.source)
         return self.mean[:count], self.cov[:count], self.mean[count:], self.cov[count:]
 
-    def gather(self, at: Rows, extras: Mapping[str, Any]) -> SourceTracks:
-        """Stack members (M, K) for a rule."""
+    def gather(self, at: Rows, extras: Mapping[str, Any], take_particles: bool) -> SourceTracks:
+        """Stack members (M, K) for a rule; particles stay such for one that takes them, and among themselves."""
         dof = self.tracks.dof[at]
         mixture = None
         if self.tracks.components > 1:
-            weight = self.tracks.weight[at]
-            used = int(np.flatnonzero(weight.any((0, 1)))[-1]) + 1  # the rest pads, say for a central track
-            mixture = Mixture(weight[..., :used], self.tracks.mean[at, :used], self.tracks.cov[at, :used])
+            bare = _bare(self.tracks)[at]
+            merge = bare & ~bare.all(1, keepdims=True) if take_particles else self.particles[at]
+            mixture = self._mixtures(at, merge)
         return SourceTracks(self.mean[at], self.cov[at], None if np.isinf(dof).all() else dof, mixture, extras)
+
+    def _mixtures(self, at: Rows, merge: Bools) -> Mixture:
+        """Mixtures of members (M, K); those of `merge`, (M, K), by their Gaussians."""
+        sole = np.arange(self.tracks.components) == 0
+        weight = np.where(merge[..., None], sole, self.tracks.weight[at])
+        mean = np.where(merge[..., None, None], self.mean[at][:, :, None], self.tracks.mean[at])
+        cov = np.where(merge[..., None, None, None], self.cov[at][:, :, None], self.tracks.cov[at])
+        used = int(np.flatnonzero(weight.any((0, 1)))[-1]) + 1  # the rest pads, say for a central track
+        return Mixture(weight[..., :used], mean[:, :, :used], cov[:, :, :used])
+
+
+def _bare(tracks: TrackBatch) -> Bools:
+    """Tell which tracks are particles, components without covariance, (N,)."""
+    return np.asarray(~tracks.cov.any((1, 2, 3)))
+
+
+def _conditioned_components(cov: Array, which: Bools) -> Array:
+    """Components' covariances (N, C, n, n) of some tracks fit to be inverted: noise of prediction may be singular."""
+    if which.any():
+        cov = cov.copy()
+        cov[which] = conditioned(cov[which].reshape(-1, *cov.shape[2:])).reshape(-1, *cov.shape[1:])
+    return cov
 
 
 def _sole_target(pool: _Pool, fresh: Bools) -> tuple[Rows, int]:

@@ -656,3 +656,44 @@ def test_a_rule_that_samples_goes_on_in_its_stream_and_begins_anew_after_reset()
 def test_particle_variances_must_fit_the_axes():
     with pytest.raises(ParameterError, match="must hold 4 numbers, one an axis, or none. Got 1"):
         centre(particle_variances=(1.0,))
+
+
+@pytest.mark.parametrize("late", [False, True], ids=["on time", "predicted"])
+@pytest.mark.parametrize("rule", [key for key, rule in RULES.items() if not rule.needed(rule.params())])
+def test_every_rule_but_one_that_joins_particles_takes_their_gaussian(rule, late):
+    rng = np.random.default_rng(7)
+    stamps = (SECOND - late * SECOND // 10, SECOND)
+    scans = {k: cloud(rng, stamp, shift=k) for k, stamp in enumerate(stamps)}
+    found, _ = centre(rule=rule).step(SECOND, scans)
+    gaussians = {
+        k: TrackBatch.gaussian(LAYOUT, "map", *scan.moments, time_ns=scan.time_ns, status=scan.status)
+        for k, scan in scans.items()
+    }
+    expected, _ = centre(rule=rule).step(SECOND, gaussians)
+    for got, wanted in zip(found.moments, expected.moments, strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=1e-9, atol=1e-12)
+
+
+def screening(batch):
+    """What a reader of the batch rejects."""
+    fields = {name: value for name, value in vars(batch).items() if name != "moments"}
+    return TrackBatch.screened(**fields)[1]
+
+
+@pytest.mark.parametrize("noise", ["continuous", "piecewise_constant"])
+@pytest.mark.parametrize("other", ["none", "gaussian", "particles"])
+def test_particles_that_meet_covariances_are_published_as_readers_take_them(noise, other):
+    """A track with and without covariances, or with those of a prediction of deficient rank, would be rejected."""
+    rng, late = np.random.default_rng(8), SECOND - SECOND // 10
+    scans = {0: cloud(rng, late if other != "gaussian" else SECOND)}
+    scans |= {"none": {}, "gaussian": {1: tracks([(10, 0)], SECOND)}, "particles": {1: cloud(rng, SECOND)}}[other]
+    own = centre(
+        rule="arithmetic_average",
+        rule_params=ArithmeticAverageParams(output="mixture"),
+        motion=MotionParams(noise_form=noise),
+        association="single_target",
+    )
+    fused, info = own.step(SECOND, scans)
+    assert info.members.tolist() == [1, len(scans) - 1]
+    assert (fused.weight > 0).sum() > 1 or other == "gaussian"
+    assert not screening(fused)

@@ -147,4 +147,5 @@ RULE = Rule(
     source="Li 2022 (6), (10)-(11), (39), (40), (45)",
     cost="K n^3, about ten times that for weights that are sought with K > 2",
     needs_when=(("target", "criterion", "target"), ("likelihood", "criterion", "likelihood")),
+    takes_particles=True,
 )

@@ -87,6 +87,7 @@ class Rule:
     #: (extra, parameter, value): an optional extra that is used only when the parameter has this value
     optional_when: tuple[tuple[str, str, str], ...] = ()
     affine_equivariant: bool | str = True  # a string says why not, or under which parameters
+    takes_particles: bool = False  # components without covariance; the fusion centre gives other rules their Gaussian
     linear: bool = False  # the fused mean is linear in the means; all else depends on the covariances alone
 
     def __call__(self, tracks: SourceTracks, params: Params | None = None) -> FusedTracks:
