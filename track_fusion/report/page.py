@@ -18,6 +18,8 @@ VERDICTS = ("agrees", "ordering only", "does not reproduce", "not given")
 UNITS = {"mps": "m/s", "degps": "deg/s", "m2": "m²", "m4": "m⁴", "k": "K", "k2": "K²"}
 #: Tables without published figures that are longer than this are folded.
 FOLDED_ABOVE = 8
+#: So many tables without published figures are shown; where there are more, all of them are folded.
+BARE_SHOWN = 4
 #: A claim that more figures decide shows them when asked.
 EVIDENCE_SHOWN = 6
 
@@ -172,7 +174,8 @@ def _tables(figures: Sequence[Mapping[str, Any]]) -> str:
     for figure in figures:
         groups.setdefault(figure["name"].rpartition("/")[2], []).append(figure)
     tables = {q: _table(q, rows) for q, rows in groups.items()}
-    folded = {q for q, rows in groups.items() if len(rows) > FOLDED_ABOVE and not any(map(_published, rows))}
+    bare = {q for q, rows in groups.items() if not any(map(_published, rows))}
+    folded = {q for q in bare if len(groups[q]) > FOLDED_ABOVE or len(bare) > BARE_SHOWN}
     shown = "".join(table for q, table in tables.items() if q not in folded)
     hidden = "".join(
         f"<details><summary>{escape(quantity_text(q))}: {len(groups[q])} rows, nothing published</summary>"
