@@ -168,7 +168,9 @@ def test_one_generator_serves_a_single_run():
 
 
 @pytest.mark.parametrize(
-    ("draw", "law"), [(normals, "norm"), (uniforms, "uniform"), (exponentials, "expon")], ids=lambda x: str(x)
+    ("draw", "law"),
+    [(normals, "norm"), (uniforms, "uniform"), (exponentials, "expon")],
+    ids=lambda x: x if isinstance(x, str) else x.__name__,
 )
 def test_draws_have_their_law_and_one_generator_a_run(draw, law):
     rng = [np.random.default_rng(i) for i in range(4)]
