@@ -13,7 +13,7 @@ from track_fusion.association.assignment import assign, nearest_neighbour
 from track_fusion.association.gate import gate
 from track_fusion.chi_square import chi_square_quantile
 from track_fusion.filters.extended import predict
-from track_fusion.linalg import Array, is_positive_definite
+from track_fusion.linalg import RIDGE, Array, is_well_conditioned
 from track_fusion.models.base import Motion
 from track_fusion.params import ParameterError, Params, param
 from track_fusion.random_streams import RandomParams
@@ -22,9 +22,6 @@ from track_fusion.track_manager import Bools, Changes, TrackManager, TrackManage
 from track_fusion.tracks import COASTED, CONFIRMED, TrackBatch
 
 SECOND_NS = 1_000_000_000
-#: A covariance is sound when it stays definite with this share of its variances taken away: some thousand times the
-#: rounding error of inverting it.
-RIDGE = 1e-12
 #: Added to variances that may be zero, as those of particles that coincide; SI units squared.
 LEAST_VARIANCE = 1e-24
 
@@ -378,14 +375,11 @@ def conditioned(cov: Array) -> Array:
 
     A covariance sound in itself may turn so by prediction over a long time. Others are returned as they are.
     """
-    ridge = RIDGE * np.eye(cov.shape[-1])
-    reduced = cov * (1.0 - ridge)
-    try:
-        np.linalg.cholesky(reduced)
-    except np.linalg.LinAlgError:
-        weak = ~is_positive_definite(reduced)[:, None, None]
-        return np.where(weak, cov * (1.0 + ridge) + LEAST_VARIANCE / RIDGE * ridge, cov)
-    return cov
+    weak = ~is_well_conditioned(cov)
+    if not weak.any():
+        return cov
+    eye = np.eye(cov.shape[-1])
+    return np.where(weak[:, None, None], cov * (1.0 + RIDGE * eye) + LEAST_VARIANCE * eye, cov)
 
 
 def predicted_to(batch: TrackBatch, time_ns: int, motion: Motion) -> TrackBatch:

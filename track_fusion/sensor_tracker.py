@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from track_fusion.linalg import Array, mahalanobis_squared, transpose
+from track_fusion.linalg import Array, is_well_conditioned, mahalanobis_squared, transpose
 from track_fusion.models.base import Motion, Sensor
 from track_fusion.models.choices import SENSORS, MotionChoice, square_matrix
 from track_fusion.models.measurement import RangeBearingSensor
@@ -60,6 +60,14 @@ class SensorTrackerParams(Params):
         strict=True,
     )
     track_id: int = param(1, "identifier of the track", low=0, high=0xFFFFFFFF)
+
+
+class LostTrackError(ValueError):
+    """A scan left a tracker without a track: `reason` is cannot_start or lost_track."""
+
+    def __init__(self, reason: str, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,11 +159,30 @@ class SensorTracker:
         Returns
         -------
         TrackBatch    one track, coasted when there is no detection; none before the first detection
+
+        Raises
+        ------
+        LostTrackError    a detection far off or of a wild covariance was too much for the numbers; the tracker goes on
+                          with the next scan
         """
         if self._track is None:
             self._track = self._started(time_ns, values, covs)
             return self._track if self._track is not None else TrackBatch.empty(self.layout, self.frame_id)
-        track = self.filter.predict(self._track, self.motion.over((time_ns - self.time_ns) / SECOND_NS))
+        try:
+            track = self._updated(self._track, time_ns, values, covs)
+            faults = ", ".join(track.faults)
+        except np.linalg.LinAlgError as error:
+            faults = str(error)
+        if faults:
+            self.reset()
+            if _sees_position(self.sensor, self.layout):
+                self._track = None  # a detection tells more than a state of long ago
+            raise LostTrackError("lost_track", f"The state is no density any more ({faults}): the track starts anew.")
+        self._track = track
+        return track
+
+    def _updated(self, track: TrackBatch, time_ns: int, values: Array, covs: Array | None) -> TrackBatch:
+        track = self.filter.predict(track, self.motion.over((time_ns - self.time_ns) / SECOND_NS))
         if len(values):
             noises = (
                 np.broadcast_to(self.sensor.noise, (len(values), *self.sensor.noise.shape)) if covs is None else covs
@@ -163,12 +190,11 @@ class SensorTracker:
             at = self._nearest(track, values, noises) if len(values) > 1 else 0
             sensor = self.sensor if covs is None else _OfDetection(self.sensor, noises[at])
             track = self.filter.update(track, values[at], sensor)
-        self._track = track.replace(
+        return track.replace(
             time_ns=np.array([time_ns]),
             status=np.array([CONFIRMED if len(values) else CONFIRMED | COASTED], np.uint8),
             source=np.array([self._provenance]),
         )
-        return self._track
 
     def _started(self, time_ns: int, values: Array, covs: Array | None) -> TrackBatch | None:
         if not len(values):
@@ -177,7 +203,12 @@ class SensorTracker:
         mean, cov = np.zeros(self.layout.size), self.params.initial_turn_rate_sd**2 * np.eye(self.layout.size)
         cov[self.layout.velocity, self.layout.velocity] = self.params.initial_speed_sd**2
         at, mean[at], cov[np.ix_(at, at)] = _seen(self.sensor, self.layout, values[0], noise)
-        return self._begun(mean, cov, time_ns)
+        if not is_well_conditioned(cov):
+            raise LostTrackError("cannot_start", "No track can start from the detection: it does not tell a position.")
+        try:
+            return self._begun(mean, cov, time_ns)
+        except ValueError as error:
+            raise LostTrackError("cannot_start", f"No track can start from the detection: {error}") from None
 
     def _nearest(self, track: TrackBatch, values: Array, noises: Array) -> int:
         (mean,), (cov,) = track.moments

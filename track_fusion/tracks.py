@@ -153,6 +153,11 @@ class TrackBatch:
         """Which tracks no source supported at their time, (N,)."""
         return (self.status & COASTED) > 0
 
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """Reasons for which some track is bad; :meth:`replace` does not check what it takes."""
+        return tuple(reason for reason, bad in _faults(self).items() if bad.any())
+
     @classmethod
     def empty(cls, layout: StateLayout, frame_id: str) -> TrackBatch:
         """Make a batch of no tracks."""

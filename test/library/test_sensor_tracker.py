@@ -11,7 +11,7 @@ from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
 from track_fusion.params import ParameterError, Params
 from track_fusion.random_streams import stream
-from track_fusion.sensor_tracker import SensorTracker, SensorTrackerParams
+from track_fusion.sensor_tracker import LostTrackError, SensorTracker, SensorTrackerParams
 from track_fusion.track_filters import TRACK_FILTERS, SirParams, StudentTParams
 from track_fusion.tracks import COASTED, CONFIRMED, StateLayout, TrackBatch, planar_layout
 
@@ -321,3 +321,55 @@ def test_particles_without_weight_do_not_vanish():
     assert (found.weight > 0).all()
     batch, rejected = TrackBatch.screened(**{k: v for k, v in vars(found).items() if k != "moments"})
     assert (len(batch), +rejected) == (1, {})
+
+
+# ---- wild detections ------------------------------------------------------------------------------------------------
+
+
+def steps(own, *scans):
+    """Step through (time, detection, variance or None); say for each what is published: good, or why nothing."""
+    for time_s, z, variance in scans:
+        covs = None if variance is None else variance * np.eye(2)[None]
+        try:
+            batch = own.step(time_s * SECOND, np.array([z]), covs)
+        except LostTrackError as error:
+            yield error.reason
+        else:
+            yield ", ".join(batch.faults) or "good"
+
+
+@pytest.mark.parametrize("key", [key for key in TRACK_FILTERS if key != "kalman"])
+def test_a_track_lost_to_a_wild_detection_starts_anew(key):
+    """Detections as far and as sharp as the screening lets pass wreck any filter; it must not stay so."""
+    layout = StateLayout(("x", "y", "vx", "vy", "turn_rate"))
+    turning = CoordinatedTurn(layout, CoordinatedTurnParams())
+    sensor = LinearSensor.position(layout, 1.0)
+    track_filter = make(TRACK_FILTERS, key, TRACK_FILTERS[key].params(), turning, sensor)
+    own = SensorTracker(turning, sensor, track_filter, "map", SensorTrackerParams())
+    wild = [(1, (5.0, 1.0), 1.0), (2, (9e11, 1.0), 1.0), (3, (5.0, 1.0), 1.0), (4, (9e11, 9e11), 1e-20)]
+    tame = [(k, (5.0, 1.0), 1.0) for k in range(5, 12)]
+    found = list(steps(own, *wild, *tame))
+    assert set(found) <= {"good", "lost_track"}
+    assert found[0] == found[-1] == "good"
+    assert key == "particle" or "lost_track" in found
+    if "lost_track" in found:  # the state is that of the detections since
+        (mean,), _ = own.step(12 * SECOND, np.array([[5.0, 1.0]]), None).moments
+        np.testing.assert_allclose(mean[:2], [5.0, 1.0], atol=1e-3 if key != "particle" else 5.0)
+
+
+@pytest.mark.parametrize("z", [(0.0, 0.5), (0.0, 1.0), (1e-9, 1.0), (1e12, 1.0)])
+def test_a_detection_from_which_no_track_can_start_is_told(z):
+    """At range 0 a bearing says nothing: the position has no covariance across."""
+    own = radar_tracker("extended", initial_speed_sd=10.0)
+    far = [(1, z, 1e20 if z[0] > 1.0 else None), (2, (500.0, 1.0), None)]
+    assert list(steps(own, *far)) == ["cannot_start", "good"]
+
+
+def test_a_lost_track_that_detections_cannot_start_goes_back_to_its_initial_state():
+    motion, sensor = MOTION, LinearSensor(("vx", "vy"), np.eye(4)[2:], np.eye(2))
+    kalman = TRACK_FILTERS["kalman"].make(motion, sensor, Params())
+    initial = SensorTrackerParams(initial_mean=(1.0, 2.0, 3.0, 4.0), initial_cov=(1.0,) * 4)
+    own = SensorTracker(motion, sensor, kalman, "map", initial)
+    found = list(steps(own, (1, (3.0, 4.0), None), (2, (9e11, 0.0), 1e-20), (3, (9e11, 0.0), 1e-20)))
+    assert (found[0], found[-1]) == ("good", "lost_track")
+    assert own.time_ns == 0

@@ -506,3 +506,29 @@ def test_trackers_of_other_sensors_and_filters_count_bad_detections_and_track_on
             diagnostics.wait_for_counts(name, {"absurd_value": 5, "negative_range": 5, "not_finite": 10})
         assert outputs["cubature"][-1].width == 1
         assert outputs["particle"][-1].width == 50
+
+
+def test_a_tracker_tells_of_a_detection_that_starts_no_track_and_goes_on(ros_context: Any, ros_domain: int) -> None:
+    """A target at the sensor itself: its bearing says nothing. The scan is answered all the same, by no tracks."""
+    params = {"use_sim_time": True, "filter": "extended", "sensor": "range_bearing", "axes": list(AXES)}
+    with ExitStack() as stack:
+        probe = stack.enter_context(Probe(ros_context))
+        diagnostics, output = Diagnostics(probe), probe.listen("/radar/tracks", PointCloud2)
+        node = stack.enter_context(
+            NodeProcess("sensor_tracker", node="radar", params=params | {"expected_subscribers": 1})
+        )
+        scans = probe.publisher("/radar/detections", PointCloud2, deadline_s=START_S)
+        ticker = probe.publisher("/clock", Clock, deadline_s=START_S)
+        for k, distance in enumerate((0.0, 50.0), start=1):
+            stamp = FIRST_NS + k * PERIOD_NS
+            scan = DetectionArrays(("range", "bearing"), "map", stamp, np.array([[distance, 0.5]]), None)
+            scans.publish(detection_table_to_msg(scan))
+
+            def answered(count: int = k, stamp: int = stamp) -> bool:
+                ticker.publish(clock(stamp))
+                return len(output) >= count
+
+            probe.wait_for(answered, STEP_S, f"scan {k}")
+        diagnostics.wait_for_counts("radar", {"cannot_start": 1})
+        assert [m.width for m in output] == [0, 1]
+        assert node.running

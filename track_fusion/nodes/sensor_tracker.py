@@ -21,7 +21,13 @@ from track_fusion.nodes.managed import ManagedNode, end, run
 from track_fusion.nodes.ros_params import chosen, declare
 from track_fusion.params import ParameterError, Params, param
 from track_fusion.pda_tracker import PdaTracker, PdaTrackerParams
-from track_fusion.sensor_tracker import MULTI_TARGET, SensorTracker, SensorTrackerParams, TrackerChoice
+from track_fusion.sensor_tracker import (
+    MULTI_TARGET,
+    LostTrackError,
+    SensorTracker,
+    SensorTrackerParams,
+    TrackerChoice,
+)
 from track_fusion.track_filters import TRACK_FILTERS
 from track_fusion.tracks import StateLayout, TrackBatch
 
@@ -140,7 +146,11 @@ class SensorTrackerNode(ManagedNode):
             same = scan.time_ns == self.tracker.time_ns
             self.reject({"duplicate_scan" if same else "out_of_order_scan": 1})
             return
-        batch = self.tracker.step(scan.time_ns, *screened_detections(self, scan))
+        try:
+            batch = self.tracker.step(scan.time_ns, *screened_detections(self, scan))
+        except LostTrackError as error:
+            self.reject({error.reason: 1}, str(error))
+            batch = TrackBatch.empty(self.tracker.layout, self.frame.frame_id)
         self.counted["scans"] += 1
         self._taken += 1
         if self._taken % self.output.publish_every:
