@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -101,8 +101,8 @@ class FusionCentre:
 
     Raises
     ------
-    ParameterError    the rule needs what source tracks do not bring, such as their cross-covariance; not one number an
-                      axis in `particle_variances`
+    ParameterError    the rule needs what source tracks do not bring, such as their cross-covariance; weights are given
+                      that do not fit the sources; not one number an axis in `particle_variances`
     """
 
     def __init__(
@@ -136,7 +136,24 @@ class FusionCentre:
         self._manager_params = manager_params or TrackManagerParams()
         self._gamma = chi_square_quantile(params.gate_probability, self.layout.size)
         self._sources = sources
+        self._weights = np.array(getattr(self._rule_params, "weights", ()))
+        if len(self._weights) or getattr(self._rule_params, "criterion", "") == "given":
+            self._try_weights()
         self.reset()
+
+    def _try_weights(self) -> None:
+        """Refuse weights that the rule would refuse when every source has a track: see it on equal ones."""
+        count, n = self._sources + self.params.memory, self.layout.size
+        if count == 1:
+            return
+        equal = SourceTracks(np.zeros((1, count, n)), np.tile(np.eye(n), (1, count, 1, 1)))
+        try:
+            self.rule.fuse(equal, self._rule_params)
+        except ValueError as error:
+            what = "one a source, the central track first" if self.params.memory else "one a source"
+            raise ParameterError(
+                f"The parameters of the rule '{self.rule.key}' do not fit {count} tracks, {what}: {error}"
+            ) from None
 
     def reset(self) -> None:
         """Forget all tracks and scans."""
@@ -251,9 +268,11 @@ class FusionCentre:
         unconverged = 0
         for size in sorted(set(counts.tolist()) - {0}):
             rows = np.flatnonzero(counts == size)
-            batch, failed = self._apply(pool, order[first[rows][:, None] + np.arange(size)])
-            parts.append((rows, batch))
-            unconverged += failed
+            at = order[first[rows][:, None] + np.arange(size)]
+            for some, params in self._weighed(pool, at):
+                batch, failed = self._apply(pool, at[some], params)
+                parts.append((rows[some], batch))
+                unconverged += failed
         if not parts:
             return pool.tracks, 0
         if len(parts) == 1:
@@ -261,14 +280,32 @@ class FusionCentre:
         joined = TrackBatch.concatenate([b for _, b in parts])
         return joined[np.argsort(np.concatenate([r for r, _ in parts]), kind="stable")], unconverged
 
-    def _apply(self, pool: _Pool, at: Rows) -> tuple[TrackBatch, int]:
+    def _weighed(self, pool: _Pool, at: Rows) -> Iterator[tuple[Rows | slice, Params]]:
+        """Split members (M, K) by their sources where weights are given: rows, and the rule's parameters for them.
+
+        Of fewer members than weights, the weights keep their proportions; where all are zero, they are equal.
+        """
+        count = at.shape[1]
+        if count == 1 or count >= len(self._weights):
+            yield slice(None), self._rule_params
+            return
+        central = at >= len(pool.source)
+        place = np.where(central, 0, pool.source[np.where(central, 0, at)] + self.params.memory)
+        kinds, kind = np.unique(place, axis=0, return_inverse=True)
+        for k, own in enumerate(kinds):
+            total = self._weights[own].sum()
+            share = self._weights[own] / total if total else np.full(count, 1.0 / count)
+            given: dict[str, Any] = {"weights": tuple(share)}
+            yield np.flatnonzero(kind.ravel() == k), dataclasses.replace(self._rule_params, **given)
+
+    def _apply(self, pool: _Pool, at: Rows, params: Params) -> tuple[TrackBatch, int]:
         """Put members, (M, K) rows of the pool, through the rule; a single one is taken as it is."""
         bit = pool.bit[at]
         existence = np.where(bit > 0, pool.tracks.existence[at], 0.0).max(1)
         first = pool.tracks[at[:, 0]].replace(source=np.bitwise_or.reduce(bit, axis=1), existence=existence)
         if at.shape[1] == 1:
             return first, 0
-        fused = self.rule.fuse(pool.gather(at, self._extras, self.rule.takes_particles), self._rule_params)
+        fused = self.rule.fuse(pool.gather(at, self._extras, self.rule.takes_particles), params)
         unconverged = int(np.count_nonzero(~np.asarray(fused.info.get("converged", True))))
         weight, mean, cov = _components(fused)
         dof = np.full(len(at), np.inf) if fused.dof is None else fused.dof

@@ -105,7 +105,7 @@ class SensorTracker:
     Raises
     ------
     ParameterError    the initial state does not fit the layout, or its covariance is not positive definite; there is
-                      none, and the sensor does not see positions
+                      none, and the sensor does not see positions, or there is a covariance alone
     """
 
     def __init__(
@@ -113,6 +113,8 @@ class SensorTracker:
     ) -> None:
         self.motion, self.sensor, self.filter = motion, sensor, track_filter
         self.layout, self.frame_id, self.params = motion.layout, frame_id, params
+        if params.initial_cov and not params.initial_mean:
+            raise ParameterError("The 'initial_mean' parameter must be given with an initial_cov. Got none.")
         if not params.initial_mean and not _sees_position(sensor, self.layout):
             raise ParameterError(
                 "The 'initial_mean' parameter must be given: from detections of "

@@ -15,6 +15,7 @@ from track_fusion.params import ParameterError
 from track_fusion.random_streams import RandomParams, stream
 from track_fusion.rules import RULES, SourceTracks
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
+from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.track_manager import TrackManagerParams
 from track_fusion.tracks import COASTED, CONFIRMED, StateLayout, TrackBatch, planar_layout
 
@@ -697,3 +698,60 @@ def test_particles_that_meet_covariances_are_published_as_readers_take_them(nois
     assert info.members.tolist() == [1, len(scans) - 1]
     assert (fused.weight > 0).sum() > 1 or other == "gaussian"
     assert not screening(fused)
+
+
+# ---- weights one a source -------------------------------------------------------------------------------------------
+
+
+def given(*weights):
+    return CovarianceIntersectionParams(criterion="given", weights=weights)
+
+
+@pytest.mark.parametrize("memory", [False, True])
+def test_given_weights_keep_their_proportions_where_a_source_is_missing(memory):
+    """Targets far apart, each seen by other sources: a target that one of them misses must not cost the rest a step."""
+    sources_of = [(0, 1, 2), (0, 2), (1, 2), (0, 1), (2,), (0, 1, 2)]
+    places = 1000.0 * np.arange(len(sources_of))
+    covs = [np.diag([k + 1.0, 3.0 - k, 1.0, 2.0]) for k in range(3)]
+    weights = np.array([0.4, 0.6, 0.0, 0.0] if memory else [0.6, 0.4, 0.0])
+    own = centre(3, rule_params=given(*weights), memory=memory)
+
+    def scans(time_ns):
+        rows = {k: [x for x, seen in zip(places, sources_of, strict=True) if k in seen] for k in range(3)}
+        return {k: tracks([(x + k / 4, 0) for x in rows[k]], time_ns, covs[k]) for k in range(3)}
+
+    for time_ns in (0, SECOND):
+        before = own.tracks
+        fused, _ = own.step(time_ns, scans(time_ns))
+        order = np.argsort(fused.mean[:, 0, 0])
+        for row, x, seen in zip(order, places, sources_of, strict=True):
+            means = [np.array([x + k / 4, 0.0, 0.0, 0.0]) for k in seen]
+            members, places_in = [covs[k] for k in seen], [k + memory for k in seen]
+            if memory and len(before):
+                at = np.argsort(before.mean[:, 0, 0])[np.searchsorted(places, x)]
+                motion = NearlyConstantVelocity(LAYOUT, MotionParams(process_noise=1.0)).matrices(1.0)
+                mean, cov = predict(before.mean[at, 0], before.cov[at, 0], *motion)
+                means, members, places_in = [mean, *means], [cov, *members], [0, *places_in]
+            share = weights[places_in]
+            share = share / share.sum() if share.any() else np.full(len(share), 1 / len(share))
+            expected = np.linalg.inv(sum(w * np.linalg.inv(c) for w, c in zip(share, members, strict=True)))
+            if len(members) == 1:
+                expected = members[0]
+            np.testing.assert_allclose(fused.cov[row, 0], expected, rtol=1e-9)
+            pull = sum(w * np.linalg.solve(c, m) for w, c, m in zip(share, members, means, strict=True))
+            wanted = expected @ pull if len(members) > 1 else means[0]
+            np.testing.assert_allclose(fused.mean[row, 0], wanted, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("memory", [False, True])
+@pytest.mark.parametrize(
+    ("weights", "text"),
+    [((1.0,), "one weight a source, {}. Got 1"), ((), "one weight a source, {}. Got 0"), ((0.5, 0.4, 0.3, 0.2), "")],
+)
+def test_weights_that_fit_no_step_are_refused_at_the_start(weights, text, memory):
+    with pytest.raises(ParameterError, match=f"'covariance_intersection' do not fit {3 + memory} tracks"):
+        centre(3, rule_params=given(*weights), memory=memory)
+    assert centre(1, rule_params=given(1.0))
+    if text:
+        with pytest.raises(ParameterError, match=text.format(3 + memory)):
+            centre(3, rule_params=given(*weights), memory=memory)

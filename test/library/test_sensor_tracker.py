@@ -5,7 +5,7 @@ import pytest
 
 from track_fusion.filters import cubature, extended, particle, student_t, unscented
 from track_fusion.filters.kalman import predict, update
-from track_fusion.models.choices import make
+from track_fusion.models.choices import SENSORS, LinearParams, make
 from track_fusion.models.measurement import LinearSensor, RangeBearingSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
@@ -157,6 +157,7 @@ def test_feedback_with_axes_in_another_order():
         ({"initial_mean": (0.0,) * 4, "initial_cov": (1.0,) * 3}, "must hold 4 or 16 numbers. Got 3."),
         ({"initial_mean": (0.0,) * 4, "initial_cov": (1.0, 1.0, -1.0, 1.0)}, "parameter does not fit: .*definite"),
         ({"initial_mean": (0.0,) * 4}, "must hold 4 or 16 numbers. Got 0."),
+        ({"initial_cov": (1.0,) * 4}, "'initial_mean' parameter must be given with an initial_cov. Got none."),
     ],
 )
 def test_an_initial_state_that_does_not_fit_is_refused(params, text):
@@ -183,6 +184,23 @@ def radar_tracker(key, params=None, sensor=RADAR, motion=MOTION, **initial):
     entry = TRACK_FILTERS[key]
     made = make(TRACK_FILTERS, key, params or entry.params(), motion, sensor)
     return SensorTracker(motion, sensor, made, "map", SensorTrackerParams(**initial))
+
+
+@pytest.mark.parametrize(
+    ("params", "text"),
+    [
+        ({"sensor_cov": (1.0, 0.9, 0.0, 1.0)}, "must be symmetric and positive definite. Got .1.0, 0.9, 0.0, 1.0"),
+        ({"sensor_cov": (1.0, -1.0)}, "must be symmetric and positive definite"),
+        ({"sensor_cov": (1.0, np.inf)}, "must be symmetric and positive definite"),
+        ({"sensor_cov": (1.0,)}, "must hold 2 or 4 numbers. Got 1."),
+        ({"sensor_axes": ("x", "x")}, "must hold distinct axes, at least one. Got .'x', 'x'"),
+        ({"sensor_axes": (), "sensor_cov": ()}, "must hold distinct axes, at least one"),
+        ({"sensor_axes": ("x", "q")}, "no axis q"),
+    ],
+)
+def test_a_linear_sensor_that_does_not_fit_is_refused(params, text):
+    with pytest.raises(ParameterError, match=text):
+        make(SENSORS, "linear", LinearParams(**params), LAYOUT)
 
 
 @pytest.mark.parametrize("key", ["extended", "unscented", "cubature", "student_t"])

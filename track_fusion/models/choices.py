@@ -8,7 +8,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from track_fusion.linalg import Array
+from track_fusion.linalg import Array, asymmetric, is_positive_definite
 from track_fusion.models.base import Motion, Sensor
 from track_fusion.models.measurement import LinearSensor, RangeBearingSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
@@ -88,15 +88,16 @@ def _range_bearing(layout: StateLayout, params: RangeBearingParams) -> RangeBear
 
 
 def _linear(layout: StateLayout, params: LinearParams) -> LinearSensor:
-    matrix = np.eye(layout.size)[list(layout.indices(params.sensor_axes))]
+    axes = params.sensor_axes
+    if not axes or len(set(axes)) < len(axes):
+        raise ParameterError(f"The 'sensor_axes' parameter must hold distinct axes, at least one. Got {list(axes)}.")
+    matrix = np.eye(layout.size)[list(layout.indices(axes))]
     noise = square_matrix("sensor_cov", params.sensor_cov, len(matrix))
-    try:
-        np.linalg.cholesky(noise)
-    except np.linalg.LinAlgError:
+    if not np.isfinite(noise).all() or asymmetric(noise) or not is_positive_definite(noise):
         raise ParameterError(
-            f"The 'sensor_cov' parameter must be positive definite. Got {list(params.sensor_cov)}."
-        ) from None
-    return LinearSensor(params.sensor_axes, matrix, noise)
+            f"The 'sensor_cov' parameter must be symmetric and positive definite. Got {list(params.sensor_cov)}."
+        )
+    return LinearSensor(axes, matrix, noise)
 
 
 #: Sensors by key, made from (layout, params).
