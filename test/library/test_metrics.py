@@ -37,6 +37,20 @@ def test_a_ratio_of_averages_has_the_spread_of_repeated_studies():
     assert Estimate.ratio(np.array([3.0]), np.array([2.0])).value == 1.5
 
 
+def test_standard_error_of_a_median_is_the_spread_of_repeated_studies():
+    studies = [Estimate.median(v) for v in np.exp(np.random.default_rng(5).normal(size=(4000, 50)))]
+    spread = np.std([s.value for s in studies])
+    assert np.mean([s.standard_error for s in studies]) == pytest.approx(spread, rel=0.1)
+
+
+@pytest.mark.parametrize("runs", [2, 5, 20])
+def test_the_order_statistics_about_a_median_lie_alike_on_either_side(runs):
+    values = np.random.default_rng(runs).normal(size=runs) ** 3
+    assert Estimate.median(-values).standard_error == pytest.approx(Estimate.median(values).standard_error)
+    assert Estimate.median(np.arange(4.0)).standard_error == pytest.approx(1.0)  # half of 2.5 - .5
+    assert np.isnan(Estimate.median(values[:1]).standard_error)
+
+
 def test_standard_error_is_the_spread_of_repeated_studies():
     """With errors as correlated over the steps as those of a filter."""
     rng = np.random.default_rng(0)

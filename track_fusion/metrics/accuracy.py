@@ -38,7 +38,7 @@ class Estimate:
         values, runs = np.sort(np.asarray(values, float)), len(values)
         if runs < 2:
             return cls(float(np.median(values)), float("nan"), runs)
-        ranks = np.clip([(runs - np.sqrt(runs)) / 2, (runs + np.sqrt(runs)) / 2], 0, runs - 1)
+        ranks = np.clip([(runs - 1 - np.sqrt(runs)) / 2, (runs - 1 + np.sqrt(runs)) / 2], 0, runs - 1)
         low, high = np.interp(ranks, np.arange(runs), values)
         return cls(float(np.median(values)), float(0.5 * (high - low)), runs)
 
