@@ -102,7 +102,7 @@ def test_rules_are_compared_by_their_error():
     square = ((points[:, None] - THETA) ** 2).mean()
     assert found["given-arithmetic_average/fig5_rms_error_1"][0] == pytest.approx(np.sqrt(square), rel=1e-3)
     needy = RuleChoice("split_covariance_intersection", SplitCovarianceIntersectionParams())
-    with pytest.raises(ParameterError, match="nothing beside the tracks"):
+    with pytest.raises(ParameterError, match="which needs '.*' beside the tracks"):
         SCENARIO.compare([needy], [0], 0, lambda share: None)
 
 

@@ -180,7 +180,7 @@ def test_any_rules_are_compared(samples):
         np.testing.assert_allclose(found[f"{row}/far_mass_1"], samples[f"{row}/far"][:4], rtol=1e-9)
     assert (found["given-naive/lost_targets_1"] >= 3).all()  # one Gaussian cannot cover them all
     needy = RuleChoice("split_covariance_intersection", SplitCovarianceIntersectionParams())
-    with pytest.raises(ParameterError, match="nothing beside the tracks"):
+    with pytest.raises(ParameterError, match="which needs '.*' beside the tracks"):
         SCENARIO.compare([needy], [0], 1, lambda share: None)
 
 

@@ -323,7 +323,8 @@ CLAIMS = (
         lambda ratio: ratio.value >= 1.0,
     ),
     Claim.order(
-        "errors of FOCI at platform 2 vary much more from fusion to fusion than those of IGS",
+        "errors of FOCI at platform 2 vary more than those of IGS (judged: standard deviation of the logarithm from "
+        "fusion to fusion, any more)",
         "5.4.3, Fig. 15",
         f"{BY_IGS}/log10_position_error_sd_p2_1",
         f"{BY_FOCI}/log10_position_error_sd_p2_1",

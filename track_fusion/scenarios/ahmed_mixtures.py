@@ -14,11 +14,10 @@ from track_fusion.densities.mixture import Mixture, log_pdf, moments, stacked
 from track_fusion.densities.mixture_divergence import grid, kl_on_grid
 from track_fusion.densities.mixture_quotient import exact_bound, exact_quotient
 from track_fusion.linalg import Array, transpose
-from track_fusion.params import ParameterError
 from track_fusion.random_streams import stream
 from track_fusion.report.chart import Chart, Contours
 from track_fusion.rules import RULES, FusedTracks, SourceTracks
-from track_fusion.scenarios.base import Progress, RuleChoice, Samples
+from track_fusion.scenarios.base import Progress, RuleChoice, Samples, check_needs
 
 #: Half the sides of the squares in which the sources' and the common information's means lie.
 SOURCE_HALF, COMMON_HALF = 14.0, 20.0
@@ -145,13 +144,7 @@ def compare(
     ------
     ParameterError    a rule needs more beside the tracks than their common information
     """
-    for choice in rules:
-        more = set(RULES[choice.key].needed(choice.params)) - {"common"}
-        if more:
-            raise ParameterError(
-                f"A rule of this scenario must need no more beside the tracks than 'common'. Got '{choice.key}', "
-                f"which needs '{min(more)}'."
-            )
+    check_needs(rules, ("common",))
     found: Samples = {f"given-{choice.name}/kld_nats": np.empty(len(runs)) for choice in rules}
     for row, run in enumerate(runs):
         problem = draw(seed, run)

@@ -17,11 +17,10 @@ from track_fusion.filters.interacting_multiple_model import Modes
 from track_fusion.linalg import Array
 from track_fusion.models.measurement import RangeRangeRateSensor
 from track_fusion.models.turn import KnownTurn, KnownTurnParams
-from track_fusion.params import ParameterError
 from track_fusion.peers import Fuse, Peer, Schedule, communicate, gaussian, ring, sources
 from track_fusion.random_streams import stream
 from track_fusion.rules import RULES
-from track_fusion.scenarios.base import RuleChoice
+from track_fusion.scenarios.base import RuleChoice, check_needs
 from track_fusion.tracks import StateLayout
 
 LAYOUT = StateLayout(("x", "vx", "y", "vy"))
@@ -109,11 +108,8 @@ def fuse_modes(choice: RuleChoice, seed: int) -> Fuse[MixtureModes]:
     ------
     ParameterError    the rule needs something beside two tracks
     """
+    check_needs([choice])
     rule = RULES[choice.key]
-    needed = rule.needed(choice.params)
-    if needed:
-        raise ParameterError(f"The rule must need nothing but tracks: on a ring there is no '{needed[0]}'. "
-                             f"Got '{choice.name}'.")  # fmt: skip
 
     def fuse(own: MixtureModes, heard: MixtureModes, common: MixtureModes | None, count: int) -> MixtureModes:
         extras = {"seed": np.random.default_rng([seed, count])} if "seed" in rule.optional else {}

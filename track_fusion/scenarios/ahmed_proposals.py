@@ -34,14 +34,14 @@ from track_fusion.scenarios.ahmed_mixtures import (
     divergence,
     shown,
 )
-from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, Scenario, chosen
+from track_fusion.scenarios.base import Claim, Printed, Progress, RuleChoice, Samples, Scenario, chosen
 
 #: Fig. 7: divergence in nats of the true fused density from each approximation, one problem.
 FIGURE_7 = {
     "given-mixture_exact@ingis": 0.2555,
     "given-mixture_exact@laplace": 0.3763,
     "given-mixture_exact@lagis": 0.1054,
-    "given-mixture_exact@heavy_tail": 0.0910,
+    "given-mixture_exact@heavy_tail": Printed("0.0910"),
 }
 #: Samples a mixand; components of each source and of the common information.
 MIXAND_SAMPLES, SOURCE_COUNT, COMMON_COUNT = 500, 4, 16
@@ -210,19 +210,20 @@ def _all_mixands(samples: Samples) -> Iterator[Chart]:
 
 
 CLAIMS = (
-    Claim.order(
-        "effective samples grow from INGIS to LAGIS to heavy tails, on average over the mixands",
-        "Fig. 8(a)",
-        *(_row(proposal, "ess_1") for proposal in PROPOSALS),
+    Claim.least(
+        "LAGIS and heavy tails have more effective samples than INGIS, on average over the mixands",
+        "Section 5.2, Fig. 8(a)",
+        _row("ingis", "ess_1"),
+        [_row(proposal, "ess_1") for proposal in PROPOSALS[1:]],
     ),
     Claim(
-        "LAGIS or heavy tails give the best effective sample size of nearly all (90 %) mixands",
+        "LAGIS or heavy tails give the best effective sample size generally (judged: of nine in ten mixands)",
         "Section 5.2, Fig. 8(a)",
         (_row("ingis", "beaten_1"),),
         lambda share: share.value >= 0.9,
     ),
     Claim(
-        "heavy tails are sometimes, in more than a twentieth of the mixands, worse than LAGIS",
+        "heavy tails are sometimes worse than LAGIS (judged: in more than a twentieth of the mixands)",
         "Section 5.2, Fig. 8(a)",
         (_row("heavy_tail", "below_lagis_1"),),
         lambda share: share.value > 0.05,

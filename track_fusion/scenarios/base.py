@@ -173,6 +173,18 @@ Samples = dict[str, Array]
 Progress = Callable[[float], None]
 
 
+class Printed(float):
+    """A published value by its print, where that ends in a zero, which a float forgets: Printed("10.70")."""
+
+    def __new__(cls, text: str) -> Printed:
+        """Read the print and keep it."""
+        value = super().__new__(cls, text)
+        value.text = text
+        return value
+
+    text: str
+
+
 @dataclasses.dataclass(frozen=True)
 class Claim:
     """Something a paper claims that is no single figure, and how it is judged.
@@ -199,6 +211,20 @@ class Claim:
 
         return cls(text, source, needs, holds)
 
+    @classmethod
+    def least(cls, text: str, source: str, figure: str, others: Sequence[str]) -> Claim:
+        """Claim that a figure is less than each of some others."""
+        return cls(text, source, (figure, *others), lambda first, *rest: all(first.value < e.value for e in rest))
+
+    @classmethod
+    def greatest(cls, text: str, source: str, figure: str, others: Sequence[str], times: float = 1.0) -> Claim:
+        """Claim that a figure exceeds so many times each of some others."""
+
+        def holds(first: Estimate, *rest: Estimate) -> bool:
+            return all(first.value > times * e.value for e in rest)
+
+        return cls(text, source, (figure, *others), holds)
+
 
 @dataclasses.dataclass(frozen=True)
 class Scenario:
@@ -211,7 +237,7 @@ class Scenario:
     ----------
     key, title, paper          identification
     shows : str                what one learns from it
-    published : mapping        figure name -> value as printed
+    published : mapping        figure name -> value as printed: Printed where the print ends in a zero
     published_runs : int       Monte Carlo runs behind the published figures
     default_runs : int         runs for a quick look; 1 where nothing is random
     publication_runs : int     runs for figures to be quoted
@@ -341,6 +367,33 @@ def check_needs(choices: Sequence[RuleChoice], given: Collection[str] = ()) -> N
             )
 
 
+def compare_each(
+    name: str,
+    rules: Sequence[RuleChoice],
+    progress: Progress,
+    measure: Callable[[RuleChoice], Mapping[str, Array]],
+    given: Collection[str] = (),
+) -> Samples:
+    """Measure any rules one after the other: what many scenarios' `compare` is.
+
+    Parameters
+    ----------
+    name : str            of the filter, the beginning of the figures' names
+    measure : callable    rule -> {quantity and unit: (R,)}
+    given                 extras that the scenario has for rules that need them
+
+    Raises
+    ------
+    ParameterError    a rule needs something else
+    """
+    check_needs(rules, given)
+    found: Samples = {}
+    for done, choice in enumerate(rules):
+        found |= {f"{name}-{choice.name}/{quantity}": values for quantity, values in measure(choice).items()}
+        progress((done + 1) / len(rules))
+    return found
+
+
 def chosen(rows: Mapping[str, T], only: str) -> dict[str, T]:
     """Return the rows whose names start with `only`.
 
@@ -405,9 +458,10 @@ def verdict(scenario: Scenario, name: str, measured: Mapping[str, Estimate]) -> 
 
 
 def rounding(published: float) -> float:
-    """Half a unit of the last digit with which a number is written down here; an int counts as exact."""
+    """Half a unit of the last digit of the print, which is what stands in the table here; an int counts as exact."""
     if isinstance(published, int):
         return 0.0
-    exponent = Decimal(repr(published)).as_tuple().exponent
+    printed = published.text if isinstance(published, Printed) else repr(published)
+    exponent = Decimal(printed).as_tuple().exponent
     assert isinstance(exponent, int)
     return 0.5 * 10.0**exponent

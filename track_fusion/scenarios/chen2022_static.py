@@ -21,7 +21,7 @@ from track_fusion.rules.geodesic_projection import GeodesicProjectionParams
 from track_fusion.rules.mhdp_explicit import MhdpExplicitParams
 from track_fusion.rules.mhdp_iterative import MhdpIterativeParams
 from track_fusion.rules.quasi_minimal_manhattan import QuasiMinimalManhattanParams
-from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, Scenario, check_needs, chosen
+from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, Scenario, chosen, compare_each
 
 #: The local estimates of 5.1: means, and scatters (scalar: the squares of scale parameters).
 MEANS, SCATTERS = np.array([2.0, 4.0]), np.array([5.0, 7.0])
@@ -135,14 +135,12 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
     ------
     ParameterError    a rule needs more than the tracks
     """
-    check_needs(rules)
-    found = {}
-    for done, choice in enumerate(rules):
-        for name, setting in SETTINGS.items():
-            distance = setting.from_barycenter(setting.fuse(choice))
-            found[f"given-{choice.name}/rao_distance_{name}_1"] = np.full(len(runs), distance)
-        progress((done + 1) / len(rules))
-    return found
+
+    def measure(choice: RuleChoice) -> Samples:
+        distances = {name: setting.from_barycenter(setting.fuse(choice)) for name, setting in SETTINGS.items()}
+        return {f"rao_distance_{name}_1": np.full(len(runs), value) for name, value in distances.items()}
+
+    return compare_each("given", rules, progress, measure)
 
 
 def charts(samples: Samples) -> list[Chart]:

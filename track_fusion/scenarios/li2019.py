@@ -10,9 +10,8 @@ from track_fusion.densities.log_domain import normalised
 from track_fusion.densities.mixture import Mixture, log_pdf, moments
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.params import ParameterError
 from track_fusion.rules import RULES, FusedTracks, SourceTracks
-from track_fusion.scenarios.base import Progress, RuleChoice, Samples, chosen
+from track_fusion.scenarios.base import Progress, RuleChoice, Samples, check_needs, chosen
 
 PAPER = (
     "Li et al., Second Order Statistics Analysis and Comparison between Arithmetic and Geometric Average Fusion, 2019, "
@@ -51,14 +50,8 @@ def fuse(choice: RuleChoice, tracks: SourceTracks) -> FusedTracks:
     ------
     ParameterError    the rule needs something beside the tracks
     """
-    rule = RULES[choice.key]
-    needed = rule.needed(choice.params)
-    if needed:
-        raise ParameterError(
-            f"The 'rules' parameter must name rules that need nothing beside the tracks. Got {choice.key!r}, which "
-            f"needs '{needed[0]}'."
-        )
-    return rule.fuse(tracks, choice.params)
+    check_needs([choice])
+    return RULES[choice.key].fuse(tracks, choice.params)
 
 
 # Mixtures of one axis.

@@ -15,7 +15,7 @@ from track_fusion.metrics.accuracy import Estimate
 from track_fusion.report.chart import Chart, Series
 from track_fusion.rules import RULES, FusedTracks, SourceTracks
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
-from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, Scenario, check_needs, chosen
+from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, Scenario, chosen, compare_each
 
 #: Section III-B: mean and variance of the densities and of the target in each case.
 DENSITIES = np.array([[40.0, 400.0], [50.0, 200.0], [60.0, 100.0], [100.0, 400.0]])
@@ -149,15 +149,13 @@ def compare(choices: Sequence[RuleChoice], runs: Sequence[int], seed: int, progr
     ------
     ParameterError    a rule needs more than the densities and the target
     """
-    check_needs(choices, ("target",))
-    found = {}
-    for done, choice in enumerate(choices):
-        for case in TARGETS:
-            fused = fit(choice, case)
-            value = divergence(fused.mean, fused.cov, case)
-            found[f"given-{choice.name}/kld_case_{case}_nats"] = np.full(len(runs), value)
-        progress((done + 1) / len(choices))
-    return found
+
+    def measure(choice: RuleChoice) -> Samples:
+        fits = {case: fit(choice, case) for case in TARGETS}
+        values = {case: divergence(fused.mean, fused.cov, case) for case, fused in fits.items()}
+        return {f"kld_case_{case}_nats": np.full(len(runs), value) for case, value in values.items()}
+
+    return compare_each("given", choices, progress, measure, ("target",))
 
 
 def charts(samples: Samples) -> list[Chart]:

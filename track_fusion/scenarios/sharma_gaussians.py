@@ -192,9 +192,9 @@ SCENARIO = Scenario(
             "The covariance shrinks from GMD-S to HMD-S to HMD-GA.", "5.2, Fig. 1a",
             "harmonic_mean", "harmonic_mean@sampled", "geometric_mean_sampling",
         ),
-        _order(
-            "HMD-GA claims the least of the generalised means and ICI, at the same weights.", "6, Fig. 1a",
-            "harmonic_mean", "inverse_covariance_intersection", "harmonic_mean@sampled", "covariance_intersection",
+        Claim.least(
+            "HMD-GA claims less than ICI, HMD-S and CI at the same weights.", "6, Fig. 1a, A",
+            f"given-{HMD_GA.name}/determinant_1", [f"given-{c.name}/determinant_1" for c in (ICI, HMD_S, CI)],
         ),
         _order(
             "HMD-GA is tighter than ICI when each finds its own weights: (75)-(76).", "7",

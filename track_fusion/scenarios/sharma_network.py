@@ -20,7 +20,7 @@ from track_fusion.rules.ellipsoidal_intersection import EllipsoidalIntersectionP
 from track_fusion.rules.harmonic_mean import HarmonicMeanParams
 from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
 from track_fusion.rules.naive import NaiveParams
-from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, check_needs, chosen, fuse_runs
+from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, chosen, compare_each, fuse_runs
 
 RULE_CHOICES = (
     RuleChoice("naive", NaiveParams()),
@@ -187,14 +187,13 @@ def compare(
     ------
     ParameterError    a rule needs more than the tracks
     """
-    check_needs(rules)
-    local, found = network.estimate(runs, seed), {}
-    for done, choice in enumerate(rules):
+    local = network.estimate(runs, seed)
+
+    def measure(choice: RuleChoice) -> Samples:
         rngs = [stream(seed, run, "rule") for run in runs]
-        error = network.fused(local, choice, rngs).mean - local.state
-        found[f"kf-{choice.name}/error_1"] = np.linalg.norm(error, axis=1)
-        progress((done + 1) / len(rules))
-    return found
+        return {"error_1": np.linalg.norm(network.fused(local, choice, rngs).mean - local.state, axis=1)}
+
+    return compare_each("kf", rules, progress, measure)
 
 
 # What the paper says of both tests.

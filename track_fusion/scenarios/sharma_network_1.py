@@ -88,7 +88,8 @@ SCENARIO = Scenario(
     assumptions=(
         "assumed: the topology, a figure: S4 <- S1; S5 <- S2; S6 <- S3; S7 <- S4, S5; S8 <- S5, S6; S9 <- S4, S6; "
         "S10 <- S7, S8, S9; each node folds its senders in this order onto its own estimate",
-        "assumed: a common prior, from which the state is drawn and at whose mean every node starts",
+        "assumed: a common prior, from which the state is drawn and at whose mean every node starts; its mean is "
+        "read as (0, 1)",
         shared.TRACE_WEIGHTS,
         "(82) as printed makes all covariances commute, H_5 is singular, and CI returns what S10 has itself; @one_row: "
         "each node measures the first row of (82) alone",

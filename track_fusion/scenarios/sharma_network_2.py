@@ -73,7 +73,8 @@ SCENARIO = Scenario(
     assumptions=(
         "assumed: the topology, a figure: S5 <- S1, S2, S3, S4, folded in this order onto its own estimate, once, "
         "after five steps of prediction and update",
-        "assumed: a common prior, from which the state is drawn and at whose mean every node starts",
+        "assumed: a common prior, from which the state is drawn and at whose mean every node starts; its mean is "
+        "read as (0, 1)",
         shared.TRACE_WEIGHTS,
         "S1 and S5 have equal covariances, where CI and ICI report the same at any weight: both get 1/2, so that the "
         "errors average; at a weight of 0 or 1 the news of S1 would be lost",

@@ -16,7 +16,7 @@ from track_fusion.rules import RULES
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.harmonic_mean import HarmonicMeanParams
 from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
-from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, Scenario, check_needs, chosen, fuse_runs
+from track_fusion.scenarios.base import Claim, Progress, RuleChoice, Samples, Scenario, chosen, compare_each, fuse_runs
 
 STEPS = 100
 
@@ -224,16 +224,16 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
     ------
     ParameterError    a rule needs more than the two tracks
     """
-    check_needs(rules)
     normals = _normals(runs, seed)
-    found: Samples = {}
-    for done, choice in enumerate(rules):
+
+    def measure(choice: RuleChoice) -> Samples:
+        found = {}
         for setting in SETTINGS:
             rngs = [stream(seed, run, "rule") for run in runs]
-            square = track(setting, choice, normals, rngs).square
-            found[f"kf-{choice.name}/rmse_{setting.name}_1"] = np.sqrt(square.mean(1))
-        progress((done + 1) / len(rules))
-    return found
+            found[f"rmse_{setting.name}_1"] = np.sqrt(track(setting, choice, normals, rngs).square.mean(1))
+        return found
+
+    return compare_each("kf", rules, progress, measure)
 
 
 def _names(row: str, quantity: str) -> tuple[str, ...]:
