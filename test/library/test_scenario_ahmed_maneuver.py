@@ -1,5 +1,7 @@
 """Ahmed 5.4 against ERRATA; truth, sensors and the fusion of modes against formulas of their own; pieces."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
@@ -126,12 +128,17 @@ def test_modes_are_fused_with_the_integral_of_each_product():
     np.testing.assert_allclose(fused.probability, expected / expected.sum(), rtol=1e-4)
 
 
-def test_pieces_equal_the_whole_and_progress_goes_up():
+def test_pieces_equal_the_whole_and_progress_goes_up(monkeypatch):
+    for module in (maneuver, platforms):  # two fusions in a few steps
+        monkeypatch.setattr(module, "SCHEDULE", dataclasses.replace(platforms.SCHEDULE, period=5))
     shares = []
-    whole = maneuver.sample([3, 8], 2, shares.append, "gsf-mixture_wep", steps=62)
+    whole = maneuver.sample([3, 8], 2, shares.append, "gsf-mixture_wep", steps=11)
+    assert whole["gsf-mixture_wep before"].shape == (2, 3, 2, 4)
+    for row in (maneuver.BY_IGS, maneuver.BY_FOCI):
+        assert (whole[f"{row} before"] != whole[f"{row} variance"][:, :, 4::5]).all()
     assert shares == sorted(shares)
     assert shares[-1] == pytest.approx(1.0)
-    part = maneuver.sample([8], 2, lambda share: None, "gsf-mixture_wep", steps=62)
+    part = maneuver.sample([8], 2, lambda share: None, "gsf-mixture_wep", steps=11)
     for name, values in part.items():
         np.testing.assert_allclose(values[0], whole[name][1], rtol=1e-9, atol=1e-9, err_msg=name)
 
@@ -157,5 +164,5 @@ def test_compare_takes_any_rule_for_two_tracks(monkeypatch):
         "gsf-covariance_intersection/median_position_error_m": (1,),
         "gsf-naive/median_position_error_m": (1,),
     }
-    with pytest.raises(ParameterError, match="on a ring there is no 'common'. Got 'mixture_exact'"):
+    with pytest.raises(ParameterError, match="Got 'mixture_exact', which needs 'common' beside the tracks"):
         maneuver.compare([RuleChoice("mixture_exact", RULES["mixture_exact"].params())], [0], 0, lambda share: None)

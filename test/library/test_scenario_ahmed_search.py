@@ -59,7 +59,8 @@ def test_the_centralised_mixture_is_near_the_posterior_by_plain_bayes(start, cen
 
 
 def test_what_all_robots_saw_is_the_product_of_what_each_saw_over_the_prior(start, monkeypatch):
-    """The identity behind exact fusion, for the true posteriors on the grid."""
+    """The identity behind exact fusion, for the true posteriors on the grid, however many the views."""
+    monkeypatch.setattr(search, "STEPS", 10)
     whole = search.bayes(start)
     parts = np.zeros_like(whole)
     for robot in list(search.ROBOTS):
@@ -80,7 +81,7 @@ def test_the_target_is_seldom_seen_where_the_paper_has_it():
 
 
 def test_pieces_equal_the_whole_and_figures_cope_with_a_part(monkeypatch):
-    monkeypatch.setattr(search, "STEPS", 2)
+    monkeypatch.setattr(search, "STEPS", 1)
     shares = []
     whole = search.sample([2, 5], 1, shares.append, "gm-mixture_exact@mmgd")
     assert shares == sorted(shares)
