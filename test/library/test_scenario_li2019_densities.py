@@ -10,7 +10,7 @@ from scipy.stats import norm
 from track_fusion.params import ParameterError
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.split_covariance_intersection import SplitCovarianceIntersectionParams
-from track_fusion.scenarios.base import RuleChoice, judged_claims, judged_figures
+from track_fusion.scenarios import RuleChoice, judged_claims, judged_figures
 from track_fusion.scenarios.li2019_densities import AA, GA, PAIRS, SCENARIO, THETA, WEIGHT
 
 

@@ -8,7 +8,7 @@ from scipy.integrate import trapezoid
 from scipy.stats import norm
 
 from track_fusion.rules.geometric_average import GeometricAverageParams
-from track_fusion.scenarios.base import RuleChoice, judged_claims
+from track_fusion.scenarios import RuleChoice, judged_claims
 from track_fusion.scenarios.li2019 import exact_geometric, intensity
 from track_fusion.scenarios.li2019_mixture import AA, EXACT, GA, PARTS, SCENARIO, X, compare, fused_mixture
 

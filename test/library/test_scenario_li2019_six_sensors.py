@@ -11,7 +11,7 @@ from track_fusion.random_streams import stream
 from track_fusion.rules.mixture_hybrid import MixtureHybridParams
 from track_fusion.rules.naive import NaiveParams
 from track_fusion.rules.split_covariance_intersection import SplitCovarianceIntersectionParams
-from track_fusion.scenarios.base import RuleChoice, judged_claims
+from track_fusion.scenarios import RuleChoice, judged_claims
 from track_fusion.scenarios.li2019 import exact_geometric, intensity, scalar_mixture
 from track_fusion.scenarios.li2019_six_sensors import (
     AA,

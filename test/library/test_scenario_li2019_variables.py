@@ -8,7 +8,7 @@ from scipy.stats import kstest, multivariate_normal, norm, poisson
 
 from track_fusion.averages import average_moments, positive_normal_pair
 from track_fusion.params import ParameterError
-from track_fusion.scenarios.base import judged_claims
+from track_fusion.scenarios import judged_claims
 from track_fusion.scenarios.li2019_variables import (
     AA,
     FIGURE_1,

@@ -20,8 +20,8 @@ from track_fusion.scenarios.base import (
     check_needs,
     compare_each,
     fuse_runs,
-    verdict,
 )
+from track_fusion.scenarios.judgement import verdict
 
 # ---- rules over runs that share their covariances --------------------------------------------------------------------
 

@@ -33,9 +33,8 @@ from track_fusion.scenarios.base import (
     Scenario,
     Scene,
     Tracking,
-    judged_claims,
-    judged_figures,
 )
+from track_fusion.scenarios.judgement import judged_claims, judged_figures
 
 _MODULES = (
     li2022_linear,
