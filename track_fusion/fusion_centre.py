@@ -77,12 +77,14 @@ class StepInfo:
     shared_provenance : int     members that already hold another one's information: source tracks that say so, and
                                 with memory each central track that was fused with new ones
     unconverged : int           fusions whose weights did not converge
+    unsound : int               fusions whose result was no density, so that a single member was taken instead
     """
 
     members: Rows
     changes: Changes
     shared_provenance: int
     unconverged: int
+    unsound: int = 0
 
 
 class FusionCentre:
@@ -192,7 +194,7 @@ class FusionCentre:
         members = np.flatnonzero(target >= 0)
         target, source = target[members], pool.source[members]
         remembered = np.unique(target[target < len(self._manager.tracks)]) if self.params.memory else target[:0]
-        fused, unconverged = self._fuse(pool, members, target, births, remembered)
+        fused, failed = self._fuse(pool, members, target, births, remembered)
         member = np.zeros((len(fused), self._sources), bool)
         member[target, source] = True
         supported = np.full(len(fused), -1, np.int64)
@@ -203,7 +205,7 @@ class FusionCentre:
             published = published[published.is_confirmed]
         foreign = np.count_nonzero(pool.tracks.source[members] & ~pool.bit[members]) + len(remembered)
         taken = np.bincount(source, minlength=self._sources)
-        return published, StepInfo(taken, changes, int(foreign), unconverged)
+        return published, StepInfo(taken, changes, int(foreign), *failed)
 
     def _check(self, scan: TrackBatch, time_ns: int) -> None:
         """Refuse a scan before it changes anything."""
@@ -249,10 +251,10 @@ class FusionCentre:
             starters = np.append(starters, left[starts])
         return target, len(starters)
 
-    def _fuse(self, pool: _Pool, members: Rows, target: Rows, births: int, remembered: Rows) -> tuple[TrackBatch, int]:
+    def _fuse(self, pool: _Pool, members: Rows, target: Rows, births: int, remembered: Rows) -> tuple[TrackBatch, Rows]:
         """Fuse the members of each target, those of `remembered` with their own prediction before all.
 
-        Tracks without members keep their predicted state.
+        Tracks without members keep their predicted state. Tell also how many fusions were unconverged and unsound.
         """
         members = np.concatenate([len(pool.source) + remembered, members])
         target = np.concatenate([remembered, target])
@@ -265,20 +267,20 @@ class FusionCentre:
         if len(coasting):
             kept = pool.tracks[len(pool.source) + coasting]
             parts.append((coasting, kept.replace(source=np.zeros(len(coasting), np.uint32))))
-        unconverged = 0
+        failed = np.zeros(2, np.intp)
         for size in sorted(set(counts.tolist()) - {0}):
             rows = np.flatnonzero(counts == size)
             at = order[first[rows][:, None] + np.arange(size)]
             for some, params in self._weighed(pool, at):
-                batch, failed = self._apply(pool, at[some], params)
+                batch, counts_of = self._apply(pool, at[some], params)
                 parts.append((rows[some], batch))
-                unconverged += failed
+                failed += counts_of
         if not parts:
-            return pool.tracks, 0
+            return pool.tracks, failed
         if len(parts) == 1:
-            return parts[0][1], unconverged
+            return parts[0][1], failed
         joined = TrackBatch.concatenate([b for _, b in parts])
-        return joined[np.argsort(np.concatenate([r for r, _ in parts]), kind="stable")], unconverged
+        return joined[np.argsort(np.concatenate([r for r, _ in parts]), kind="stable")], failed
 
     def _weighed(self, pool: _Pool, at: Rows) -> Iterator[tuple[Rows | slice, Params]]:
         """Split members (M, K) by their sources where weights are given: rows, and the rule's parameters for them.
@@ -298,18 +300,36 @@ class FusionCentre:
             given: dict[str, Any] = {"weights": tuple(share)}
             yield np.flatnonzero(kind.ravel() == k), dataclasses.replace(self._rule_params, **given)
 
-    def _apply(self, pool: _Pool, at: Rows, params: Params) -> tuple[TrackBatch, int]:
-        """Put members, (M, K) rows of the pool, through the rule; a single one is taken as it is."""
-        bit = pool.bit[at]
-        existence = np.where(bit > 0, pool.tracks.existence[at], 0.0).max(1)
-        first = pool.tracks[at[:, 0]].replace(source=np.bitwise_or.reduce(bit, axis=1), existence=existence)
+    def _apply(self, pool: _Pool, at: Rows, params: Params) -> tuple[TrackBatch, tuple[int, int]]:
+        """Put members, (M, K) rows of the pool, through the rule; a single one is taken as it is.
+
+        So is the last member of a target whose fusion gives no density: its numbers must not harm the other targets.
+        """
+        first = _joined(pool, at)
         if at.shape[1] == 1:
-            return first, 0
-        fused = self.rule.fuse(pool.gather(at, self._extras, self.rule.takes_particles), params)
+            return first, (0, 0)
+        try:
+            fused = self.rule.fuse(pool.gather(at, self._extras, self.rule.takes_particles), params)
+        except np.linalg.LinAlgError:
+            return self._apply_each(pool, at, params)
         unconverged = int(np.count_nonzero(~np.asarray(fused.info.get("converged", True))))
         weight, mean, cov = _components(fused)
         dof = np.full(len(at), np.inf) if fused.dof is None else fused.dof
-        return first.replace(weight=weight, mean=mean, cov=cov, dof=dof), unconverged
+        result = first.replace(weight=weight, mean=mean, cov=cov, dof=dof)
+        sound = result.sound
+        if sound.all():
+            return result, (unconverged, 0)
+        order = np.argsort(np.concatenate([np.flatnonzero(sound), np.flatnonzero(~sound)]))
+        kept = TrackBatch.concatenate([result[sound], _joined(pool, at[~sound, -1:])])
+        return kept[order], (unconverged, int(np.count_nonzero(~sound)))
+
+    def _apply_each(self, pool: _Pool, at: Rows, params: Params) -> tuple[TrackBatch, tuple[int, int]]:
+        """Do the same target by target, after the rule could not invert a matrix of one."""
+        if len(at) == 1:
+            return _joined(pool, at[:, -1:]), (0, 1)
+        batches, failed = zip(*(self._apply(pool, at[k : k + 1], params) for k in range(len(at))), strict=True)
+        unconverged, unsound = np.sum(failed, 0).tolist()
+        return TrackBatch.concatenate(batches), (unconverged, unsound)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -398,6 +418,13 @@ def _sole_target(pool: _Pool, fresh: Bools) -> tuple[Rows, int]:
     if births or len(pool.tracks) > len(pool.source):
         target[np.unique(pool.source, return_index=True)[1]] = 0
     return target, births
+
+
+def _joined(pool: _Pool, at: Rows) -> TrackBatch:
+    """Return the first of the members, (M, K), with the provenance and existence of all."""
+    bit = pool.bit[at]
+    existence = np.where(bit > 0, pool.tracks.existence[at], 0.0).max(1)
+    return pool.tracks[at[:, 0]].replace(source=np.bitwise_or.reduce(bit, axis=1), existence=existence)
 
 
 def _components(fused: FusedTracks) -> tuple[Array, Array, Array]:

@@ -158,6 +158,14 @@ class TrackBatch:
         """Reasons for which some track is bad; :meth:`replace` does not check what it takes."""
         return tuple(reason for reason, bad in _faults(self).items() if bad.any())
 
+    @property
+    def sound(self) -> NDArray[np.bool_]:
+        """Tell which tracks are densities that a reader takes, (N,), whatever their identifiers."""
+        good = np.ones(len(self), bool)
+        for bad in _faults(self.replace(track_id=np.arange(len(self)))).values():
+            good &= ~bad
+        return good
+
     @classmethod
     def empty(cls, layout: StateLayout, frame_id: str) -> TrackBatch:
         """Make a batch of no tracks."""

@@ -1,5 +1,6 @@
 """The fusion centre: against an oracle that shares no code with it, the field's pains, consistency."""
 
+import dataclasses
 import importlib.util
 from pathlib import Path
 
@@ -755,3 +756,54 @@ def test_weights_that_fit_no_step_are_refused_at_the_start(weights, text, memory
     if text:
         with pytest.raises(ParameterError, match=text.format(3 + memory)):
             centre(3, rule_params=given(*weights), memory=memory)
+
+
+# ---- fusions that give no density -----------------------------------------------------------------------------------
+
+
+def failing(how):
+    """Naive fusion that fails for targets beyond 1 km: by its numbers, or by an error that spoils the whole batch."""
+    naive = RULES["naive"]
+
+    def fuse(sources, params):
+        far = sources.mean[:, 0, 0] > 1000.0
+        if how == "error" and far.any():
+            raise np.linalg.LinAlgError("Singular matrix")
+        fused = naive.fuse(sources, params)
+        bad = {"not finite": np.nan, "no covariance": 0.0, "error": 1.0}[how]
+        return dataclasses.replace(fused, cov=np.where(far[:, None, None], bad, fused.cov))
+
+    return dataclasses.replace(naive, key="failing", fuse=fuse)
+
+
+@pytest.mark.parametrize("how", ["not finite", "no covariance", "error"])
+def test_a_fusion_without_a_density_harms_no_other_target(how):
+    params, motion = FusionCentreParams(), NearlyConstantVelocity(LAYOUT, MotionParams())
+    own = FusionCentre(3, motion, "map", params, manager_params=EAGER, rule=failing(how))
+    good = centre(3, rule="naive", motion=MotionParams())
+    near, far = (0, 0), (2000, 0)
+    for k in range(3):
+        scans = {i: tracks([far, near] if i < 2 else [near], k * SECOND, (1 + i) * COV) for i in range(3)}
+        fused, info = own.step(k * SECOND, scans)
+        expected, _ = good.step(k * SECOND, scans)
+        assert fused.track_id.tolist() == [1, 2]
+        assert info.unsound == 1
+        assert fused.source.tolist() == [2, 7]
+        np.testing.assert_array_equal(fused.mean[0, 0], [2000.0, 0.0, 0.0, 0.0])
+        np.testing.assert_array_equal(fused.cov[0, 0], 2 * COV)
+        np.testing.assert_array_equal(fused.cov[1], expected.cov[1])
+
+
+@pytest.mark.parametrize("rule", [key for key, rule in RULES.items() if not rule.needed(rule.params())])
+def test_no_covariances_however_wild_make_a_rule_publish_what_readers_reject(rule):
+    rng = np.random.default_rng(0)
+    own = centre(6, rule=rule, publish_tentative=True)
+    with np.errstate(all="ignore"):
+        for k in range(2):
+            scans = {}
+            for i in range(6):
+                mean = rng.normal(size=(6, 4)) * 10.0 ** rng.uniform(-3, 10)
+                cov = 10.0 ** rng.uniform(-18, 20, (6, 4, 1)) * np.eye(4)
+                scans[i] = TrackBatch.gaussian(LAYOUT, "map", mean, cov, time_ns=k * SECOND)
+            fused, _ = own.step(k * SECOND, scans)
+            assert fused.faults == ()

@@ -164,6 +164,7 @@ class FusionCentreNode(ManagedNode):
         self._latency_s = time.perf_counter() - began
         self.counted["steps"] += 1
         self.counted["unconverged"] += self._last.unconverged
+        self.counted["unsound"] += self._last.unsound
         self.counted["deleted"] += len(self._last.changes.deleted)
 
     def _publish(self, fused: TrackBatch, stamp_ns: int) -> None:
@@ -185,6 +186,8 @@ class FusionCentreNode(ManagedNode):
             values[f"silence_s/{name}"] = round(silence, 3)
             if silence >= self._buffer_params.source_timeout_s:
                 warnings.append(f"{name} is silent for {silence:.1f} s")
+        if unsound := self.counted["unsound"]:
+            warnings.append(f"{unsound} fusions gave no density; a single source was taken instead")
         if self._last is not None:
             values["members"] = self._last.members.tolist()
             if self._last.shared_provenance and self.centre.rule.guarantee != "conservative":
