@@ -39,6 +39,24 @@ def test_a_scenario_of_the_library_alone_says_so() -> None:
     assert "runs in the library only: track-fusion reproduce sharma-gaussians" in result.stderr
 
 
+@pytest.mark.parametrize("foreign", ["thesis.tex", ".git"])
+def test_a_folder_with_something_else_in_it_is_not_cleared(foreign: str, tmp_path: Path) -> None:
+    for name in ("figures.json", foreign):
+        (tmp_path / name).write_text("")
+    result = run("demo", "li2022-linear", "--out", str(tmp_path))
+    assert result.exit_code == 1
+    assert f"holds {foreign}, which is no result of a demonstration" in result.stderr
+    assert {p.name for p in tmp_path.iterdir()} == {"figures.json", foreign}
+
+
+def test_earlier_results_are_cleared(tmp_path: Path) -> None:
+    (tmp_path / "bag").mkdir()
+    for name in ("figures.json", "tracks.png", "nodes_naive.log", "evaluation_alone.json", "bag/bag_0.mcap"):
+        (tmp_path / name).write_text("")
+    demonstration._clear(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("name", bringups())
 def test_each_demonstration_has_the_rows_of_its_scenario(name: str, tmp_path: Path) -> None:
     planned = demo_of(name, tmp_path, 0, None)

@@ -54,6 +54,8 @@ RUN_DEADLINE_S = 300.0
 FAST_RUNS = 1000
 #: Domains that Linux's default range of ephemeral ports leaves free.
 DOMAINS = 101
+#: What a demonstration writes; only a folder with nothing else is cleared.
+RESULTS = ("bag", "figures.json", "tracks.png", "nodes_*.log", "evaluation_*.json")
 TRUTH = "/replay/truth"
 FUSED = "/fusion_centre/tracks"
 TABLE, ODOMETRY = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry"
@@ -123,11 +125,9 @@ def run_demo(demo: Demo, progress: Progress) -> dict[str, Any]:
 
     Raises
     ------
-    Fault    a node failed or hung; the message names its log
+    Fault    a node failed or hung; the message names its log; or `out` holds something else than earlier results
     """
-    if demo.out.exists():
-        shutil.rmtree(demo.out)
-    demo.out.mkdir(parents=True)
+    _clear(demo.out)
     over_ros: dict[str, dict[str, float]] = {}
     for rule in demo.rules if demo.many_targets else (None, *demo.rules):
         over_ros[rule or "alone"] = _over_ros(demo, rule, progress)
@@ -136,6 +136,18 @@ def run_demo(demo: Demo, progress: Progress) -> dict[str, Any]:
     (demo.out / "figures.json").write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
     _picture(demo)
     return result
+
+
+def _clear(out: Path) -> None:
+    """Make an empty folder, of earlier results if there are any, and of nothing else."""
+    if out.exists() and not out.is_dir():
+        raise Fault(f"{out} is no folder.")
+    foreign = [p.name for p in sorted(out.glob("*")) if not any(p.match(pattern) for pattern in RESULTS)]
+    if foreign:
+        raise Fault(f"{out} holds {foreign[0]}, which is no result of a demonstration: it would be deleted.")
+    if out.exists():
+        shutil.rmtree(out)
+    out.mkdir(parents=True)
 
 
 def _library(demo: Demo, rows: list[str], progress: Callable[[float], None]) -> tuple[Figures, Figures]:
