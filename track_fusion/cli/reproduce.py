@@ -156,12 +156,11 @@ def _table(quantity: str, figures: list[dict[str, Any]]) -> Table:
     from rich.markup import escape
 
     from track_fusion.cli.output import table
-    from track_fusion.report.page import measured_text
+    from track_fusion.report.page import measured_text, published_text
 
     found = table("filter and rule", "measured", "published", "verdict", title=f"{quantity}, ± standard error")
     found.columns[1].justify = found.columns[2].justify = "right"
     for f in figures:
-        published = "" if f["published"] is None else f"{f['published']:g}"
         verdict = f"[{STYLES[f['verdict']]}]{f['verdict']}[/]"
-        found.add_row(escape(f["name"].rpartition("/")[0]), measured_text(f), published, verdict)
+        found.add_row(escape(f["name"].rpartition("/")[0]), measured_text(f), published_text(f["published"]), verdict)
     return found

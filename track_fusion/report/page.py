@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from track_fusion.report.chart import Chart
 from track_fusion.report.drawing import svg
-from track_fusion.scenarios.base import Scenario
+from track_fusion.scenarios.base import Printed, Scenario
 
 VERDICTS = ("agrees", "ordering only", "does not reproduce", "not given")
 #: Units whose names in figures lack signs.
@@ -195,7 +195,7 @@ def _table(quantity: str, rows: Sequence[Mapping[str, Any]]) -> str:
     body = "".join(
         f"<tr><td class='name'>{_breakable(f['name'].rpartition('/')[0])}</td>"
         f"<td class='number'>{measured_text(f)}</td>"
-        f"<td class='number'>{'' if f['published'] is None else format(f['published'], 'g')}</td>"
+        f"<td class='number'>{published_text(f['published'])}</td>"
         f"<td class='{_class(f['verdict'])}'>{escape(f['verdict'])}</td></tr>"
         for f in rows
     )
@@ -210,6 +210,13 @@ def quantity_text(quantity: str) -> str:
     """Write position_armse_m as "position armse / m"; a pure number has no unit."""
     name, _, unit = quantity.rpartition("_")
     return name.replace("_", " ") + ("" if unit == "1" else f" / {UNITS.get(unit, unit)}")
+
+
+def published_text(value: float | None) -> str:
+    """Write a published figure as it is printed."""
+    if value is None:
+        return ""
+    return value.text if isinstance(value, Printed) else f"{value:g}"
 
 
 def measured_text(figure: Mapping[str, Any]) -> str:
