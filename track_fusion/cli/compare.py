@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 @click.command(short_help="Compare fusion rules on a published scenario.")
 @click.argument("name", metavar="SCENARIO")
 @click.option("--rules", required=True, metavar="A,B,...",
-              help="Rules, with commas between: keys, key@variant as the scenario has it, or Python files that define "
-              "RULE.")  # fmt: skip
+              help="Rules, with commas and no blanks between: keys, key@variant as in the rows of `track-fusion "
+              "reproduce`, or Python files that define RULE.")  # fmt: skip
 @click.option("--params", default="{}", metavar="JSON",
               help='Parameters, as {"covariance_intersection": {"criterion": "trace"}}.  [default: the scenario\'s '
               "own, else the rule's]")  # fmt: skip

@@ -42,12 +42,15 @@ def demo(name: str, rules: str | None, seed: int, runs: int | None, out: Path) -
     """Run a published scenario by real ROS 2 processes, with each rule, and set it beside the library and the paper.
 
     Replay, one tracker a sensor, the fusion centre and the evaluator run as processes of their own, in lockstep, as
-    the parameter file config/NAME.yaml says. Writes a bag (mcap), figures.json and tracks.png.
+    the parameter file config/NAME.yaml says; NAME is li2022-linear unless given, and `track-fusion scenarios` says
+    which there are. Takes one to a few minutes. Writes a bag (mcap), figures.json and tracks.png. The verdict is on
+    the many runs of the library; `track-fusion reproduce --help` says what it means.
 
-    Examples: track-fusion demo li2022-linear --rules naive,arithmetic_average
-
-    track-fusion demo li2022-nonlinear-sir
-    """
+    \b
+    Examples:
+      track-fusion demo li2022-linear --rules naive,arithmetic_average
+      track-fusion demo li2022-nonlinear-sir
+    """  # noqa: D301  click reads \b as "do not wrap"
     from track_fusion.nodes.demo import demo_of, run_demo
     from track_fusion.nodes.managed import Fault
 

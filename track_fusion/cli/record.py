@@ -17,8 +17,10 @@ def record(out: Path, topics: tuple[str, ...], storage: str, sim_time: bool) -> 
 
     A topic is NAME, or NAME:TYPE when it has no publisher yet.
 
-    Example: track-fusion record run1 /fusion_centre/tracks /replay/truth:nav_msgs/msg/Odometry
-    """
+    \b
+    Example:
+      track-fusion record run1 /fusion_centre/tracks /replay/truth:nav_msgs/msg/Odometry
+    """  # noqa: D301  click reads \b as "do not wrap"
     from track_fusion.nodes.managed import Fault
     from track_fusion.nodes.record import record_until_told
 

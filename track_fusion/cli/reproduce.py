@@ -33,7 +33,7 @@ STYLES = {"agrees": "green", "ordering only": "yellow", "does not reproduce": "r
     "--jobs", type=click.IntRange(min=1), help="Processes; the figures do not depend on it.  [default: cores]"
 )
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out/reproduce", show_default=True,
-              help="Where results.json, report.html and finished pieces go.")  # fmt: skip
+              help="Where results.json and report.html, which are replaced, and finished pieces go.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON: one object, or a list of them for several names.")
 def reproduce(
     names: tuple[str, ...], every: bool, runs: int | None, publication: bool, seed: int, only: str, jobs: int | None,
@@ -44,13 +44,13 @@ def reproduce(
     NAME is a scenario (`track-fusion scenarios` lists them) or a Python file that defines SCENARIO. Writes
     results.json (figures, claims, the curves of the pictures) and report.html, one page that needs nothing else.
     A run that was interrupted goes on where it was when the same command is given again. Equal seeds give equal
-    figures. The verdict on a figure is
+    figures, but for the times that ahmed-random measures. The verdict on a figure is
 
     \b
       agrees               the difference is within 3 standard deviations, of our runs and the paper's together
       ordering only        the figure stands to the others of its table as published
       does not reproduce   neither; of a claim: it is not true of what was measured
-      not given            nothing to compare with, or a single run, whose error is unknown
+      not given            nothing to compare with, or a single random run, whose error is unknown
 
     \b
     Examples:
