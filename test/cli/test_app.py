@@ -68,9 +68,9 @@ def test_a_command_loads_only_what_it_needs(words: tuple[str, ...]) -> None:
 @pytest.mark.parametrize(
     ("module", "words", "advice"),
     [
-        ("click", ["rules"], "pip install track_fusion[cli]"),
-        ("rich", ["rules"], "pip install track_fusion[cli]"),
-        ("rclpy", ["docs", "--check"], "source ROS 2 Jazzy, or pip install track_fusion[ros]"),
+        ("click", ["rules"], "pip install '.[cli]' in the source tree"),
+        ("rich", ["rules"], "pip install '.[cli]' in the source tree"),
+        ("rclpy", ["docs", "--check"], "source ROS 2 Jazzy, or pip install '.[ros]' in the source tree"),
     ],
 )
 def test_a_missing_package_is_one_line(module: str, words: list[str], advice: str) -> None:

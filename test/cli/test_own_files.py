@@ -105,6 +105,23 @@ def test_a_table_for_people(examples: Path) -> None:
     assert re.search(r"naive +covariance_intersection +0\.\d+ ± 0\.\d+ +< \.0001", result.stdout)
 
 
+def test_a_single_run_has_no_error_and_no_significance(examples: Path) -> None:
+    result = run("compare", "chen2022-static", "--rules", "covariance_intersection,mhdp_explicit")
+    assert result.exit_code == 0, result.stderr
+    assert "1 run, seed 0" in result.stdout
+    assert "±" not in result.stdout.replace("mean ± standard error", "")
+    words = (str(examples / "two_thermometers.py"), "--rules", "naive,covariance_intersection", "--runs", "1")
+    answer = compared(*words)
+    assert {d["p_value"] for d in answer["quantities"][0]["differences"]} == {None}
+    assert {r["standard_error"] for r in answer["quantities"][0]["rules"]} == {None}
+
+
+def test_of_one_rule_there_are_no_pairs(examples: Path) -> None:
+    result = run("compare", str(examples / "two_thermometers.py"), "--rules", "naive", "--runs", "20")
+    assert result.exit_code == 0, result.stderr
+    assert "worse" not in result.stdout
+
+
 REFUSED = [
     (("--rules", "naiv"), "Did you mean 'naive'"),
     (("--rules", "naive,naive"), "The '--rules' must differ"),

@@ -212,7 +212,7 @@ def test_the_page_is_whole_and_asks_for_nothing_from_outside(files: Coin) -> Non
 def test_the_table_shows_error_published_and_verdict(files: Coin) -> None:
     result = run("reproduce", files.coin)
     assert result.exit_code == 0
-    assert "error_m, ± standard error" in result.stdout
+    assert "error / m, ± standard error" in result.stdout
     rows = [re.split(r" {2,}", line.rstrip()) for line in result.stdout.splitlines()]
     assert ["kf-alone", "1.000 ± 0.010", "1.01", "agrees"] in rows
     assert ["kf-ic", "9.000 ± 0.010", "0.5", "does not reproduce"] in rows

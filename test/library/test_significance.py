@@ -50,3 +50,11 @@ def test_ties_and_single_runs():
     assert np.isnan(single.p_value)
     assert not single.significant
     assert paired_differences({"a": same}) == []
+
+
+def test_rounding_is_no_difference():
+    same = np.arange(1.0, 6.0)
+    (tie,) = paired_differences({"a": same, "b": same * (1.0 + 1e-13)})
+    assert (tie.mean, tie.p_value, tie.significant) == (0.0, 1.0, False)
+    (real,) = paired_differences({"a": same, "b": same * (1.0 + 1e-6)})
+    assert real.significant

@@ -62,6 +62,11 @@ def test_a_node_starts_has_its_topics_and_ends(name: str, number: int, ros_conte
         probe.wait_for(lambda: wanted <= topics_of(probe, name), 5.0, f"{wanted} among the topics of {name}")
         assert not {source.replace("~", f"/{name}") for source in node.remappings} & topics_of(probe, name)
         assert process.stop(number) == 0, process.output()
+        if name == "fusion_centre":
+            doing = (
+                "Fusing x y vx vy in frame 'map' by covariance_intersection from /sensor_1/tracks, /sensor_2/tracks."
+            )
+            assert doing in process.output()
 
 
 def test_launch_arguments_override_the_parameter_file(ros_context: Any, tmp_path: Path) -> None:

@@ -19,6 +19,6 @@ def main() -> None:
         if module not in _EXTRAS:
             raise
         advice = "source ROS 2 Jazzy, or " if module == "rclpy" else ""
-        advice += f"pip install track_fusion[{_EXTRAS[module]}]"
+        advice += f"pip install '.[{_EXTRAS[module]}]' in the source tree"
         print(f"track-fusion: the Python package {module} is missing: {advice}", file=sys.stderr)
         sys.exit(1)

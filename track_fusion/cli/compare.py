@@ -134,22 +134,20 @@ def _print(
     from track_fusion.report.page import measured_text, quantity_text
 
     out = console()
-    out.print(f"[bold]{escape(scenario.key)}[/bold]  {runs} runs, seed {seed}, smaller is better")
+    out.print(f"[bold]{escape(scenario.key)}[/bold]  {runs} run{'s' * (runs > 1)}, seed {seed}, smaller is better")
     for (one, quantity), scores in groups.items():
         means = table("rule", "mean ± standard error", title=f"{one}: {quantity_text(quantity)}")
         for rule in sorted(scores, key=lambda r: float(scores[r].mean())):
-            means.add_row(escape(rule), measured_text(vars(Estimate.mean(scores[rule]))))
+            mean = Estimate.mean(scores[rule])
+            means.add_row(escape(rule), measured_text(mean.value, mean.standard_error))
         out.print("", means)
         pairs = table("better", "worse", "by", "p")
         for d in differences[one, quantity]:
-            by = measured_text({"value": d.mean, "standard_error": _known(d.standard_error)})
+            by = measured_text(d.mean, d.standard_error)
             style = "" if d.significant else "dim"
             pairs.add_row(escape(d.first), escape(d.second), by, _p_text(d), style=style)
-        out.print(pairs)
-
-
-def _known(error: float) -> float | None:
-    return None if error != error else error  # NaN: of one run
+        if pairs.row_count:
+            out.print(pairs)
 
 
 def _p_text(difference: Difference) -> str:

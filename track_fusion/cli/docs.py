@@ -159,6 +159,7 @@ def scenarios_page() -> str:
 
 def _scenario_section(scenario: Scenario) -> str:
     from track_fusion.nodes.bringup import demos_of
+    from track_fusion.report.page import assumption_text
 
     demos = ", ".join(f"`track-fusion demo {name}`" for name in demos_of(scenario.key))
     runs = f"* Runs: {scenario.default_runs} by default, {scenario.publication_runs} for figures to be quoted, "
@@ -168,7 +169,7 @@ def _scenario_section(scenario: Scenario) -> str:
         f"{runs}{scenario.published_runs} in the paper" if scenario.random else "* Nothing in it is random.",
         *([f"* Over ROS: {demos}"] if demos else []),
         *(f"* Claim: {claim.text} ({claim.source})" for claim in scenario.claims),
-        *(f"* Assumed: {text.removeprefix('assumed: ')}" for text in scenario.assumptions),
+        *(f"* Assumed: {assumption_text(text)}" for text in scenario.assumptions),
     ]
     return "\n\n".join([f"## {scenario.key}", f"{scenario.title}.", "\n".join(facts)])
 

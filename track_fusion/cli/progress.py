@@ -22,5 +22,13 @@ def studies(works: Sequence[Work], jobs: int, store: Path | None) -> Iterator[St
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     bar = Progress(*columns, console=err, transient=True)
     tasks = {work: bar.add_task(f"{work.scenario}, {work.runs} runs", total=1.0) for work in works}
+
+    def progress(work: Work, share: float) -> None:
+        bar.update(tasks[work], completed=share)
+
+    def interrupted() -> None:
+        kept = "; the same command then goes on from there" if store is not None else ""
+        err.print(f"Stopping when the pieces at work are done{kept} ...")
+
     with bar if err.is_terminal else contextlib.nullcontext():
-        yield from run_studies(works, jobs, store, lambda work, share: bar.update(tasks[work], completed=share))
+        yield from run_studies(works, jobs, store, progress, interrupted)

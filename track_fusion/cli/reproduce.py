@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -75,6 +76,8 @@ def reproduce(
             return scenario.default_runs
         return runs or (scenario.publication_runs if publication else scenario.default_runs)
 
+    import matplotlib  # noqa: F401  the page needs it: better missing now than after the work
+
     chosen = tuple(SCENARIOS) if every else tuple(dict.fromkeys(names))
     works = [Work(name, wanted(find_scenario(name)), seed, only) for name in chosen]
     found = []
@@ -130,13 +133,17 @@ def _print_tables(scenario: Scenario, result: dict[str, Any], took_s: float) -> 
     from rich.markup import escape
 
     from track_fusion.cli.output import console, grid, table
-    from track_fusion.report.page import evidence_text
+    from track_fusion.report.page import assumption_text, by_quantity, evidence_text, unpublished
 
     out = console()
     out.print(f"[bold]{escape(scenario.key)}[/bold]  {escape(scenario.title)}")
-    quantities = dict.fromkeys(f["name"].rpartition("/")[2] for f in result["figures"])
-    for quantity in quantities:
-        out.print("", _table(quantity, [f for f in result["figures"] if f["name"].rpartition("/")[2] == quantity]))
+    groups = by_quantity(result["figures"])
+    folded = unpublished(groups)
+    for quantity, figures in groups.items():
+        if quantity not in folded:
+            out.print("", _table(quantity, figures))
+    if folded:
+        out.print(f"\n{sum(len(groups[q]) for q in folded)} figures with nothing published: see report.html")
     if result["claims"]:
         claims = table("claim", "verdict", title="claims")
         for c in result["claims"]:
@@ -149,18 +156,20 @@ def _print_tables(scenario: Scenario, result: dict[str, Any], took_s: float) -> 
         ("Runs", f"{result['runs']}, seed {result['seed']}, {took_s:.1f} s of one processor"),
         ("Paper", scenario.paper),
     ]
-    out.print(grid([*facts, *(("Assumed", a) for a in scenario.assumptions)]))
+    out.print(grid([*facts, *(("Assumed", assumption_text(a)) for a in scenario.assumptions)]))
 
 
-def _table(quantity: str, figures: list[dict[str, Any]]) -> Table:
+def _table(quantity: str, figures: Sequence[Mapping[str, Any]]) -> Table:
     from rich.markup import escape
 
     from track_fusion.cli.output import table
-    from track_fusion.report.page import measured_text, published_text
+    from track_fusion.report.page import measured_text, published_text, quantity_text
 
-    found = table("filter and rule", "measured", "published", "verdict", title=f"{quantity}, ± standard error")
+    title = f"{quantity_text(quantity)}, ± standard error"
+    found = table("filter and rule", "measured", "published", "verdict", title=title)
     found.columns[1].justify = found.columns[2].justify = "right"
     for f in figures:
         verdict = f"[{STYLES[f['verdict']]}]{f['verdict']}[/]"
-        found.add_row(escape(f["name"].rpartition("/")[0]), measured_text(f), published_text(f["published"]), verdict)
+        measured = measured_text(f["value"], f["standard_error"])
+        found.add_row(escape(f["name"].rpartition("/")[0]), measured, published_text(f["published"]), verdict)
     return found

@@ -10,6 +10,8 @@ import numpy as np
 
 from track_fusion.linalg import Array
 
+#: A difference in one run that is a smaller share of the scores is rounding, and counts as none.
+ROUNDING = 1e-9
 #: A difference is called significant when its adjusted p-value is below this.
 SIGNIFICANCE = 0.05
 
@@ -50,12 +52,17 @@ def paired_differences(scores: Mapping[str, Array]) -> list[Difference]:
     list of Difference, the best method's first
     """
     order = sorted(scores, key=lambda name: float(scores[name].mean()))
-    pairs = [(a, b, np.asarray(scores[b] - scores[a], float)) for a, b in combinations(order, 2)]
+    pairs = [(a, b, _gap(scores[a], scores[b])) for a, b in combinations(order, 2)]
     adjusted = _holm([_p_value(gap) for _, _, gap in pairs])
     return [
         Difference(a, b, float(gap.mean()), _standard_error(gap), p)
         for (a, b, gap), p in zip(pairs, adjusted, strict=True)
     ]
+
+
+def _gap(first: Array, second: Array) -> Array:
+    gap = np.asarray(second - first, float)
+    return np.where(np.abs(gap) <= ROUNDING * np.maximum(np.abs(first), np.abs(second)), 0.0, gap)
 
 
 def _standard_error(gap: Array) -> float:

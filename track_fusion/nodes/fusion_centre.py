@@ -105,6 +105,13 @@ class FusionCentreNode(ManagedNode):
             self.subscribe(message, f"~/sources/{name}/tracks", self._reader(k, kind), depth, event_callbacks=lost)
         self.create_timer(LOOK_PERIOD_S, self._on_timer)
 
+    def on_start(self) -> None:
+        """Say what it does: a parameter file for another node's name would go unnoticed."""
+        names = self.sources.source_configurations
+        sources = ", ".join(self.resolve_topic_name(f"~/sources/{name}/tracks") for name in names)
+        what = f"{' '.join(self.frame.axes)} in frame '{self.frame.frame_id}' by {self.centre.params.state_fusion}"
+        self.log.info(f"Fusing {what} from {sources}.")
+
     def _on_lost(self, event: Any) -> None:
         self.reject(
             {"lost_in_transport": event.total_count_change}, "a queue was full: raise its depth by a QoS override"

@@ -6,7 +6,7 @@ import base64
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from html import escape
-from math import floor, log10
+from math import floor, isnan, log10
 from typing import Any, NamedTuple
 
 from track_fusion.report.chart import Chart
@@ -121,7 +121,7 @@ def _section(section: Section) -> str:
     runs = f"{result['runs']} runs, seed {result['seed']}" if scenario.random else "nothing random"
     if scenario.random:
         runs += f"; for figures to be quoted: {scenario.publication_runs} runs; in the paper: {scenario.published_runs}"
-    assumed = "".join(f"<li>{escape(a)}</li>" for a in scenario.assumptions)
+    assumed = "".join(f"<li>{escape(assumption_text(a))}</li>" for a in scenario.assumptions)
     parts = [
         f"<h2 id='{escape(scenario.key)}'>{escape(scenario.key)}: {escape(scenario.title)}</h2>",
         f"<p>{escape(_sentence(scenario.shows))}</p><p class='quiet'>{escape(scenario.paper)}.</p>",
@@ -133,6 +133,11 @@ def _section(section: Section) -> str:
         f"<ul>{assumed}</ul>" if assumed else "<p>Nothing.</p>",
     ]
     return "".join(parts)
+
+
+def assumption_text(text: str) -> str:
+    """Write an assumption under a heading that says that it is one."""
+    return text.removeprefix("assumed: ")
 
 
 def _sentence(text: str) -> str:
@@ -170,12 +175,9 @@ def _evidence(evidence: Mapping[str, float]) -> str:
 
 def _tables(figures: Sequence[Mapping[str, Any]]) -> str:
     """Write a table a quantity; long ones with nothing to compare are folded, and come last."""
-    groups: dict[str, list[Mapping[str, Any]]] = {}
-    for figure in figures:
-        groups.setdefault(figure["name"].rpartition("/")[2], []).append(figure)
+    groups = by_quantity(figures)
+    folded = unpublished(groups)
     tables = {q: _table(q, rows) for q, rows in groups.items()}
-    bare = {q for q, rows in groups.items() if not any(map(_published, rows))}
-    folded = {q for q in bare if len(groups[q]) > FOLDED_ABOVE or len(bare) > BARE_SHOWN}
     shown = "".join(table for q, table in tables.items() if q not in folded)
     hidden = "".join(
         f"<details><summary>{escape(quantity_text(q))}: {len(groups[q])} rows, nothing published</summary>"
@@ -186,15 +188,28 @@ def _tables(figures: Sequence[Mapping[str, Any]]) -> str:
     return f"<h3>Figures</h3><div class='tables'>{shown}</div>{hidden}"
 
 
-def _published(figure: Mapping[str, Any]) -> bool:
-    return figure["published"] is not None
+Groups = dict[str, list[Mapping[str, Any]]]
+
+
+def by_quantity(figures: Sequence[Mapping[str, Any]]) -> Groups:
+    """Group figures by their quantity, the end of their names."""
+    groups: Groups = {}
+    for figure in figures:
+        groups.setdefault(figure["name"].rpartition("/")[2], []).append(figure)
+    return groups
+
+
+def unpublished(groups: Groups) -> set[str]:
+    """Quantities of which nothing is published, where they or their rows are so many that they hide the rest."""
+    bare = {q for q, rows in groups.items() if all(figure["published"] is None for figure in rows)}
+    return {q for q in bare if len(groups[q]) > FOLDED_ABOVE or len(bare) > BARE_SHOWN}
 
 
 def _table(quantity: str, rows: Sequence[Mapping[str, Any]]) -> str:
     title = quantity_text(quantity)
     body = "".join(
         f"<tr><td class='name'>{_breakable(f['name'].rpartition('/')[0])}</td>"
-        f"<td class='number'>{measured_text(f)}</td>"
+        f"<td class='number'>{measured_text(f['value'], f['standard_error'])}</td>"
         f"<td class='number'>{published_text(f['published'])}</td>"
         f"<td class='{_class(f['verdict'])}'>{escape(f['verdict'])}</td></tr>"
         for f in rows
@@ -219,10 +234,9 @@ def published_text(value: float | None) -> str:
     return value.text if isinstance(value, Printed) else f"{value:g}"
 
 
-def measured_text(figure: Mapping[str, Any]) -> str:
-    """Write a figure with its standard error, where that is known and not zero."""
-    value, error = figure["value"], figure["standard_error"]
-    return rounded(value, error) if error else f"{value:.5g}"
+def measured_text(value: float, error: float | None) -> str:
+    """Write a figure with its standard error, where that is known (neither None nor NaN) and not zero."""
+    return rounded(value, error) if error and not isnan(error) else f"{value:.5g}"
 
 
 def rounded(value: float, error: float) -> str:

@@ -79,7 +79,11 @@ class Study:
 
 
 def run_studies(
-    works: Sequence[Work], jobs: int, store: Path | None, progress: Callable[[Work, float], None]
+    works: Sequence[Work],
+    jobs: int,
+    store: Path | None,
+    progress: Callable[[Work, float], None],
+    interrupted: Callable[[], None] = lambda: None,
 ) -> Iterator[Study]:
     """Run studies one after the other, their pieces by `jobs` processes.
 
@@ -90,6 +94,7 @@ def run_studies(
     store : Path or None    folder that keeps finished pieces: a study that was interrupted goes on from there. What
                             another version of the program, of NumPy or of SciPy computed is not used
     progress : callable     (work, share done)
+    interrupted : callable  called at Ctrl-C, before the pieces that have begun come to their end
 
     Yields
     ------
@@ -100,7 +105,7 @@ def run_studies(
     ParameterError    no such scenario, row or rule
     """
     folder = None if store is None else _folder(store)
-    with _workers(jobs) as pool:
+    with _workers(jobs, interrupted) as pool:
         submitted = [[(runs, _submit(pool, work, runs, folder)) for runs in work.pieces()] for work in works]
         for work, futures in zip(works, submitted, strict=True):
             parts, took_s = [], 0.0
@@ -128,13 +133,16 @@ def joined(parts: Sequence[Samples]) -> Samples:
 
 
 @contextmanager
-def _workers(jobs: int) -> Iterator[ProcessPoolExecutor]:
+def _workers(jobs: int, interrupted: Callable[[], None]) -> Iterator[ProcessPoolExecutor]:
     """Give processes with one BLAS thread each; on an error, what has not begun is dropped."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(ONE_THREAD)
     pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=_ignore_interrupts)
     try:
         yield pool
+    except KeyboardInterrupt:
+        interrupted()
+        raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
         for name, value in before.items():
