@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from cli.runner import ROOT, refusal, run, run_process, strict_json
+
+from track_fusion.rules import RULES
 
 
 @pytest.fixture(scope="module")
@@ -21,6 +24,15 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (name,) = re.findall(r"Saved as `(\w+\.py)`", text)
         (folder / name).write_text(code, encoding="utf-8")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def registry() -> Iterator[None]:
+    """Forget the rules that files bring, for other tests."""
+    before = set(RULES)
+    yield
+    for key in RULES.keys() - before:
+        del RULES[key]
 
 
 def pages_commands(page: str) -> list[str]:
