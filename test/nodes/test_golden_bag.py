@@ -149,12 +149,21 @@ def test_identities_do_not_switch(fused: Any) -> None:
         assert max(abs(np.diff(path)).max() for path in paths.values()) < 2.5, name
 
 
-@pytest.mark.parametrize("rule", ["arithmetic_average", "covariance_intersection"])
+#: Bag of detections, the scenario whose parameter file runs it, rule.
+SCENARIOS = [
+    ("turn", "li2022-nonlinear", "arithmetic_average"),
+    ("turn", "li2022-nonlinear", "covariance_intersection"),
+    ("line", "li2022-linear", "arithmetic_average"),
+    ("line", "li2022-linear", "naive"),
+]
+
+
+@pytest.mark.parametrize(("bag", "scenario", "rule"), SCENARIOS)
 def test_a_bag_of_detections_gives_the_expected_tracks_through_trackers_with_feedback(
-    rule: str, ros_context: Any, ros_domain: int
+    bag: str, scenario: str, rule: str, ros_context: Any, ros_domain: int
 ) -> None:
-    """The nonlinear scenario of Li 2022 with its own parameter file: cubature filters, a centre, and back."""
-    file, oracle = ROOT / "config" / "li2022-nonlinear.yaml", f"turn_{rule}"
+    """A scenario of Li 2022 with its own parameter file: two trackers, a centre, and back."""
+    file, oracle = ROOT / "config" / f"{scenario}.yaml", f"{bag}_{rule}"
     steps = len(expected(oracle)["steps"])
     patient = {"max_future_s": 1000.0, "feedback_timeout_s": 1000.0, "expected_subscribers": 1}
     criteria = {"covariance_intersection.criterion": "det", "arithmetic_average.criterion": "diversity"}
@@ -170,12 +179,12 @@ def test_a_bag_of_detections_gives_the_expected_tracks_through_trackers_with_fee
             stack.enter_context(tracker)
         inputs = {f"~/sources/{s}/tracks": f"/{s}/tracks" for s in SOURCES}
         stack.enter_context(NodeProcess("fusion_centre", params=fusing, params_file=file, remaps=inputs))
-        player = stack.enter_context(replay("replay_turn", GOLDEN / "turn", "/clock", rate=20.0))
+        player = stack.enter_context(replay(f"replay_{bag}", GOLDEN / bag, "/clock", rate=20.0))
         probe.wait_for(lambda: len(tables) >= steps, START_S, "the fused tracks of every step")
         assert player.wait(STEP_S) == 0
     compare(tables, oracle)
 
 
 def test_the_golden_bags_are_small() -> None:
-    for bag in ("tracks", "odometry", "turn"):
+    for bag in ("tracks", "odometry", "turn", "line"):
         assert sum(p.stat().st_size for p in (GOLDEN / bag).iterdir()) < MAX_BAG_BYTES
