@@ -112,6 +112,15 @@ def test_misspelt_names_are_refused_with_the_nearest_and_the_list() -> None:
     assert text == "Unknown scenario 'qqq'. Valid: none."
 
 
+def test_many_names_are_listed_only_where_none_is_near() -> None:
+    many = [f"parameter_{i:02d}" for i in range(41)]
+    assert (
+        str(unknown_name_error("paramter_07", many)) == "Unknown parameter 'paramter_07'. Did you mean 'parameter_07'?"
+    )
+    assert str(unknown_name_error("qqq", many)).endswith("parameter_40.")
+    assert "Valid:" in str(unknown_name_error("paramter_07", many[:40]))
+
+
 def test_nearest_says_nothing_when_nothing_is_near() -> None:
     assert nearest("zzz", ["det", "trace"]) == ""
     assert nearest("tarce", ["det", "trace"]) == " Did you mean 'trace'?"

@@ -17,6 +17,9 @@ import numpy as np
 
 T = TypeVar("T")
 
+#: More valid names than this are listed only where none is near.
+MANY_NAMES = 40
+
 
 class ParameterError(ValueError):
     """A parameter has a wrong name or value; the message names it, the limit and the value got."""
@@ -119,10 +122,13 @@ def nearest(name: str, valid: Iterable[str]) -> str:
 
 
 def unknown_name_error(name: str, valid: Iterable[str], what: str = "parameter") -> ParameterError:
-    """Make the error for a misspelt name, with the nearest valid one and the whole list."""
+    """Make the error for a misspelt name, with the nearest valid one and the list of all, unless that hides it."""
     valid = sorted(valid)
+    near = nearest(name, valid)
+    if near and len(valid) > MANY_NAMES:
+        return ParameterError(f"Unknown {what} '{name}'.{near}")
     listing = ", ".join(valid) if valid else "none"
-    return ParameterError(f"Unknown {what} '{name}'.{nearest(name, valid)} Valid: {listing}.")
+    return ParameterError(f"Unknown {what} '{name}'.{near} Valid: {listing}.")
 
 
 def from_dict(cls: type[T], values: Mapping[str, Any]) -> T:
