@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -56,7 +55,7 @@ def compare(name: str, rules: str, params: str, runs: int | None, seed: int, job
         raise ParameterError(f"The '--rules' must differ. Got {rules}.")
     count = (runs or scenario.default_runs) if scenario.random else 1
     (study,) = studies([Work(name, count, seed, rules=specs)], jobs or os.cpu_count() or 1, None)
-    groups = by_quantity(study.samples)
+    groups = by_filter_and_quantity(study.samples)
     differences = {group: paired_differences(scores) for group, scores in groups.items()}
     if as_json:
         print_json(_as_json(scenario, count, seed, groups, differences))
@@ -72,6 +71,7 @@ def rule_specs(rules: str, params: str) -> tuple[RuleSpec, ...]:
     ParameterError    not JSON of the right form, or parameters of a rule that is not named
     """
     from track_fusion.scenarios.study import RuleSpec
+    from track_fusion.scenarios.user_files import is_path
 
     try:
         given = json.loads(params)
@@ -84,15 +84,14 @@ def rule_specs(rules: str, params: str) -> tuple[RuleSpec, ...]:
         raise ParameterError(f"The '--params' must be of a rule in '--rules'. Got '{stranger}'.")
 
     def spec(word: str) -> RuleSpec:
-        is_file = Path(word).suffix == ".py"
-        rule, _, variant = (word, "", "") if is_file else word.partition("@")
+        rule, _, variant = (word, "", "") if is_path(word) else word.partition("@")
         values = {k: tuple(v) if isinstance(v, list) else v for k, v in given.get(word, {}).items()}
         return RuleSpec(rule, tuple(sorted(values.items())), variant)
 
     return tuple(map(spec, names))
 
 
-def by_quantity(samples: Samples) -> dict[tuple[str, str], Samples]:
+def by_filter_and_quantity(samples: Samples) -> dict[tuple[str, str], Samples]:
     """Group scores named <filter>-<rule>/<quantity>: {(filter, quantity): {rule: (R,)}}."""
     groups: dict[tuple[str, str], Samples] = {}
     for name, values in samples.items():
