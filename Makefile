@@ -4,7 +4,7 @@ VENV := .venv/bin/python
 STAGES ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test bench lint clean
+.PHONY: help venv demo test bench lint docs clean
 
 help:
 	@echo 'track_fusion: track-to-track fusion for ROS 2 Jazzy'
@@ -14,6 +14,7 @@ help:
 	@echo '               (some stages only: make test STAGES="lint suite")'
 	@echo '  make lint    the linters alone: ruff and mypy'
 	@echo '  make bench   measure speed and print ratios'
+	@echo '  make docs    write the pages and parameter files that are made from the code'
 	@echo '  make venv    only make or update .venv, which the others start with'
 	@echo '  make clean   remove environments, builds and results'
 	@echo
@@ -32,6 +33,9 @@ test: venv
 
 lint: venv
 	@$(VENV) tools/run_tests.py lint
+
+docs: venv
+	@$(VENV) -m tools.docs
 
 bench: venv
 	@$(VENV) -m benchmark

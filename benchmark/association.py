@@ -10,9 +10,9 @@ from scipy.optimize import linear_sum_assignment
 from benchmark.baselines import Array, association_costs_by_loop
 from benchmark.measure import Result, race
 from track_fusion.association.assignment import nearest_neighbour
-from track_fusion.chi_square import chi_square_quantile
-from track_fusion.fusion_centre import FusionCentre, FusionCentreParams
+from track_fusion.centre.centre import FusionCentre, FusionCentreParams
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
+from track_fusion.solvers.chi_square import chi_square_quantile
 from track_fusion.tracks import TrackBatch, planar_layout
 
 GAMMA = chi_square_quantile(0.99, 4)

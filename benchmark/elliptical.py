@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmark import baselines
 from benchmark.measure import Result, race
-from track_fusion.densities.spd_means import karcher_mean, log_euclidean_mean
+from track_fusion.densities.elliptical.spd_means import karcher_mean, log_euclidean_mean
 from track_fusion.rules import SourceTracks, get_rule
 
 AXES = 6

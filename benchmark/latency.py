@@ -16,7 +16,7 @@ from sensor_msgs.msg import PointCloud2
 
 from benchmark.measure import Result
 from msg_adapters.track_table import track_table_to_msg
-from track_fusion.nodes.bringup import local_environment, ros_arguments, running
+from track_fusion.demo.bringup import local_environment, ros_arguments, running
 from track_fusion.nodes.managed import qos
 from track_fusion.tracks import TrackBatch, planar_layout
 

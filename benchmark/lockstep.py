@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from benchmark.measure import Result
-from track_fusion.nodes.bringup import Nodes, local_environment, running, start_scenario
+from track_fusion.demo.bringup import Nodes, local_environment, running, start_scenario
 
 STEPS = 1000
 REPEATS = 3

@@ -9,16 +9,16 @@ import numpy as np
 
 from benchmark import baselines
 from benchmark.measure import Result, race
-from track_fusion.densities.mixture import Mixture, log_pdf
-from track_fusion.densities.mixture_proposals import (
+from track_fusion.densities.mixture.mixture import Mixture, log_pdf
+from track_fusion.densities.mixture.proposals import (
     direct_local_sampling,
     indirect_global_sampling,
     inflated_naive,
     laplace_proposal,
 )
-from track_fusion.densities.mixture_quotient import exact_quotient, wep_quotient
-from track_fusion.densities.mixture_reduction import runnalls
-from track_fusion.densities.mixture_sampling import optimise_omega, single_shot_em
+from track_fusion.densities.mixture.quotient import exact_quotient, wep_quotient
+from track_fusion.densities.mixture.reduction import runnalls
+from track_fusion.densities.mixture.sampling import optimise_omega, single_shot_em
 
 AXES = 6
 #: Runs of which a median is taken.

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmark.baselines import two_filters_and_intersection_looped
 from benchmark.measure import Result, race
-from track_fusion.scenarios.li2022_linear import RULE_CHOICES, TRACKING, fused_filters
+from track_fusion.scenarios.li2022.linear import RULE_CHOICES, TRACKING, fused_filters
 
 RUNS = 1000
 #: The loop is timed on so many runs and scaled up.

@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from track_fusion.nodes.bringup import ros_arguments
+from track_fusion.demo.bringup import ros_arguments
 
 STOP_DEADLINE_S = 5.0  # from a signal to the end of the process; a node takes well under one second
 POLL_S = 0.02  # how often a condition is looked at while nothing arrives

@@ -26,8 +26,8 @@ COIN = """
 from pathlib import Path
 import numpy as np
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.report.chart import Chart, Series
-from track_fusion.scenarios.base import Claim, Scenario
+from track_fusion.study.chart import Chart, Series
+from track_fusion.study.scenario import Claim, Scenario
 
 def sample(runs, seed, progress, only=""):
     Path(__file__).with_suffix(f".asked-{seed}-{runs.start}-{runs.stop}").touch()

@@ -18,8 +18,9 @@ from rclpy.context import Context
 from ros_helpers import NodeProcess, Probe, own_domain
 from sensor_msgs.msg import PointCloud2
 
-from track_fusion.nodes.bringup import Nodes, local_environment, running, start_scenario
-from track_fusion.scenarios import get_scenario, li2022_linear
+from track_fusion.demo.bringup import Nodes, local_environment, running, start_scenario
+from track_fusion.scenarios import get_scenario
+from track_fusion.scenarios.li2022 import linear as li2022_linear
 
 SCENARIO = "li2022-linear"
 FUSED = "/fusion_centre/tracks"
@@ -146,7 +147,7 @@ class Relay:
 
 def start_relayed(nodes: Nodes, overrides: Mapping[str, Mapping[str, Any]], steps: int) -> None:
     """Start the scenario with each tracker's feedback remapped to the relay."""
-    from track_fusion.nodes import bringup
+    from track_fusion.demo import bringup
 
     plain = bringup.ros_arguments
 

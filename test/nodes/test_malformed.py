@@ -39,13 +39,13 @@ from msg_adapters.detection_table import detection_table_from_msg, detection_tab
 from msg_adapters.header import stamp_from_ns
 from msg_adapters.odometry import odometry_from_msg, odometry_to_msgs
 from msg_adapters.track_table import track_table_to_msg
-from track_fusion.fusion_centre import FusionCentre, FusionCentreParams
+from track_fusion.centre.centre import FusionCentre, FusionCentreParams
+from track_fusion.centre.track_manager import TrackManagerParams
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.params import Params
-from track_fusion.sensor_tracker import SensorTracker, SensorTrackerParams
-from track_fusion.track_filters import TRACK_FILTERS
-from track_fusion.track_manager import TrackManagerParams
+from track_fusion.trackers.filters import TRACK_FILTERS
+from track_fusion.trackers.one_target import SensorTracker, SensorTrackerParams
 from track_fusion.tracks import StateLayout, TrackBatch, planar_layout
 
 FIRST_NS = 100 * SECOND_NS  # far enough from 0 that a stamp of 0 is stale, too: the reason must be the right one

@@ -20,12 +20,15 @@ from ros_helpers import Probe
 from sensor_msgs.msg import PointCloud2
 
 from msg_adapters.arrays import merged
+from track_fusion.demo.bringup import Bringup, bringups, local_environment, running, start_scenario
 from track_fusion.filters import extended
-from track_fusion.nodes.bringup import Bringup, bringups, local_environment, running, start_scenario
 from track_fusion.rules import RULES, get_rule
-from track_fusion.scenarios import RuleChoice, get_scenario, li2022_linear, li2022_nonlinear, sharma_radar_runs
-from track_fusion.scenarios.chen2022_dynamic import fusions
-from track_fusion.scenarios.one_target import (
+from track_fusion.scenarios import RuleChoice, get_scenario
+from track_fusion.scenarios.chen2022.dynamic import fusions
+from track_fusion.scenarios.li2022 import linear as li2022_linear
+from track_fusion.scenarios.li2022 import nonlinear as li2022_nonlinear
+from track_fusion.scenarios.sharma import radar_runs as sharma_radar_runs
+from track_fusion.study.one_target import (
     GaussianFilter,
     Row,
     Sir,

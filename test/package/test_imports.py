@@ -2,31 +2,15 @@
 
 from __future__ import annotations
 
-import ast
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from tools.house import faults
+
 ROOT = Path(__file__).resolve().parents[2]
-LIBRARY = sorted((ROOT / "track_fusion").rglob("*.py"))
-ADAPTERS = sorted((ROOT / "msg_adapters").rglob("*.py"))
-
-# A module imports from its own layer or those below. What stands in none of them is an application of the library.
-LAYERS = (
-    {"params", "linalg", "tracks", "optimise", "least_squares", "random_streams", "chi_square"},
-    {"densities", "models"},
-    {"rules", "filters", "association"},
-    {"track_manager", "scan_buffer", "metrics"},
-    {"fusion_centre", "peers"},
-    {"scenarios", "report"},
-    {"nodes"},
-    {"cli"},
-)
-APPLICATION = 5
-
 BLOCKED = """
 import importlib, pkgutil, sys
 
@@ -39,7 +23,7 @@ class Block:
 sys.meta_path.insert(0, Block())
 import track_fusion
 for module in pkgutil.walk_packages(track_fusion.__path__, "track_fusion."):
-    is_node = module.name.startswith("track_fusion.nodes")
+    is_node = module.name.startswith(("track_fusion.nodes", "track_fusion.demo"))
     if is_node == {nodes!r} and not module.name.endswith("__main__"):
         importlib.import_module(module.name)
         print(module.name)
@@ -54,32 +38,10 @@ def import_all(*, nodes: bool, blocked: set[str], suffixes: tuple[str, ...] = ()
     return set(done.stdout.split())
 
 
-def imported(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield line and full name of everything a file imports, also inside functions; names relative to its package."""
-    package = path.relative_to(ROOT).parent.parts
-    for item in ast.walk(ast.parse(path.read_text())):
-        if isinstance(item, ast.Import):
-            yield from ((item.lineno, alias.name) for alias in item.names)
-        elif isinstance(item, ast.ImportFrom):
-            base = list(package[: len(package) - item.level + 1]) if item.level else []
-            base += [item.module] if item.module else []
-            yield from ((item.lineno, ".".join([*base, alias.name])) for alias in item.names)
-
-
-def layer(name: str) -> int:
-    """Return the layer of track_fusion.<name>."""
-    return next((height for height, names in enumerate(LAYERS) if name in names), APPLICATION)
-
-
-def is_ros(name: str) -> bool:
-    root = name.split(".")[0]
-    return root in {"rclpy", "tf2_ros", "ament_index_python"} or root.endswith(("_msgs", "_interfaces"))
-
-
 @pytest.mark.colcon
 def test_the_library_imports_without_ros() -> None:
     done = import_all(nodes=False, blocked={"rclpy", "tf2_ros", "launch"}, suffixes=("_msgs", "_interfaces"))
-    assert {"track_fusion.tracks", "track_fusion.fusion_centre", "track_fusion.cli"} <= done
+    assert {"track_fusion.tracks", "track_fusion.centre.centre", "track_fusion.cli"} <= done
 
 
 @pytest.mark.colcon
@@ -88,33 +50,55 @@ def test_the_nodes_import_without_extras() -> None:
     assert {f"track_fusion.nodes.{n}" for n in ("sensor_tracker", "fusion_centre", "replay", "evaluator")} <= done
 
 
-def test_only_nodes_name_ros() -> None:
-    library = [path for path in LIBRARY if "nodes" not in path.relative_to(ROOT).parts]
-    found = [f"{p.relative_to(ROOT)}:{line} {name}" for p in library for line, name in imported(p) if is_ros(name)]
-    assert library
-    assert found == []
+def plant(root: Path, files: dict[str, str]) -> Path:
+    """Write a small house."""
+    for name, text in {"track_fusion/__init__.py": "", "msg_adapters/__init__.py": "", **files}.items():
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return root
 
 
-def test_adapters_import_messages_and_numpy_only() -> None:
-    allowed = set(sys.stdlib_module_names) | {"numpy", "msg_adapters"}
-    found = [
-        f"{path.relative_to(ROOT)}:{line} {name}"
-        for path in ADAPTERS
-        for line, name in imported(path)
-        if name.split(".")[0] not in allowed and not (is_ros(name) and not name.startswith("rclpy"))
-    ]
-    assert ADAPTERS
-    assert found == []
+def test_the_house_is_in_order() -> None:
+    assert len(list((ROOT / "track_fusion").rglob("*.py"))) > 100
+    assert faults(ROOT) == []
 
 
-def test_imports_point_one_way() -> None:
-    upward = []
-    for path in LIBRARY:
-        own = layer(path.relative_to(ROOT / "track_fusion").parts[0].removesuffix(".py"))
-        for line, name in imported(path):
-            parts = name.split(".")
-            is_init = path == ROOT / "track_fusion" / "__init__.py"
-            if parts[0] == "track_fusion" and len(parts) > 1 and not is_init and layer(parts[1]) > own:
-                upward.append(f"{path.relative_to(ROOT)}:{line} {name}")
-    assert len(LIBRARY) > 1
-    assert upward == []
+@pytest.mark.parametrize(
+    ("files", "fault"),
+    [
+        ({"track_fusion/rules/naive.py": "from track_fusion.centre import step", "track_fusion/centre/step.py": ""},
+         "track_fusion.rules.naive:1 -> track_fusion.centre.step: an arrow goes up"),
+        ({"track_fusion/linalg.py": "def f():\n    from . import cli", "track_fusion/cli/__init__.py": ""},
+         "track_fusion.linalg:2 -> track_fusion.cli: an arrow goes up"),
+        ({"track_fusion/scenarios/a.py": "import track_fusion.report.b", "track_fusion/report/b.py": ""},
+         "track_fusion.scenarios.a:1 -> track_fusion.report.b: an arrow goes across"),
+        ({"track_fusion/rules/a.py": "from track_fusion.rules import b", "track_fusion/rules/b.py": "from . import a"},
+         "circle: track_fusion.rules.a -> track_fusion.rules.b -> track_fusion.rules.a"),
+        ({"track_fusion/filters/kalman.py": "from nav_msgs.msg import Odometry"},
+         "track_fusion.filters.kalman:1 -> nav_msgs.msg.Odometry: the library imports ROS"),
+        ({"track_fusion/centre/step.py": "import rclpy"},
+         "track_fusion.centre.step:1 -> rclpy: the library imports ROS"),
+        ({"track_fusion/centre/step.py": "import msg_adapters.pose"},
+         "track_fusion.centre.step:1 -> msg_adapters.pose: only bags, demo, nodes read messages"),
+        ({"track_fusion/helpers.py": ""}, "track_fusion.helpers is in no room"),
+        ({"track_fusion/attic/old.py": ""}, "track_fusion.attic.old is in no room"),
+        ({"msg_adapters/pose.py": "import scipy"},
+         "msg_adapters.pose:1 -> scipy: an adapter imports messages and NumPy only"),
+        ({"msg_adapters/pose.py": "import track_fusion.tracks"},
+         "msg_adapters.pose:1 -> track_fusion.tracks: an adapter imports messages and NumPy only"),
+    ],
+)  # fmt: skip
+def test_what_breaks_the_rules_of_the_house_is_named(tmp_path: Path, files: dict[str, str], fault: str) -> None:
+    assert faults(plant(tmp_path, files)) == [fault]
+
+
+def test_what_keeps_them_is_not(tmp_path: Path) -> None:
+    files = {
+        "track_fusion/nodes/centre.py": "import rclpy, msg_adapters\nfrom track_fusion.centre import step",
+        "track_fusion/centre/step.py": "import numpy\nfrom track_fusion.tracks import TrackBatch",
+        "track_fusion/tracks.py": "from track_fusion.linalg import outer",
+        "track_fusion/linalg.py": "",
+        "msg_adapters/pose.py": "import numpy\nfrom nav_msgs.msg import Odometry",
+    }
+    assert faults(plant(tmp_path, files)) == []

@@ -11,10 +11,10 @@ from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import multivariate_normal
 
 from track_fusion.densities.gaussian import kl_divergence
-from track_fusion.densities.pair import FEW
 from track_fusion.linalg import Array
 from track_fusion.rules import FusedTracks, Mixture, SourceTracks
 from track_fusion.rules.arithmetic_average import RULE, ArithmeticAverageParams
+from track_fusion.solvers.pair import FEW
 
 
 def fuse(mean: Array, cov: Array, **params: Any) -> FusedTracks:

@@ -24,7 +24,7 @@ def gaussian(mean: Array, cov: Array) -> Mixture:
     return Mixture(np.ones((*mean.shape[:-1], 1)), mean[..., None, :], cov[..., None, :, :])
 
 
-# Target (39), on Fig. 2 of Li 2022: test/library/test_scenario_li2022_target_fit.py ---------------------------------
+# Target (39), on Fig. 2 of Li 2022: test/scenarios/li2022/test_target_fit.py ---------------------------------
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])

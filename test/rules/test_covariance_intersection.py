@@ -12,10 +12,10 @@ from rules.examples import covariances, rotated
 from rules.oracles import Intersection, errors, mp
 from scipy.optimize import minimize, minimize_scalar
 
-from track_fusion.densities.pair import FEW
 from track_fusion.linalg import Array
 from track_fusion.rules import FusedTracks, SourceTracks
 from track_fusion.rules.covariance_intersection import RULE, CovarianceIntersectionParams
+from track_fusion.solvers.pair import FEW
 
 CRITERIA = pytest.mark.parametrize("criterion", ["det", "trace"])
 #: Rounding of the input alone moves a covariance of this condition number by this much, relative to itself.

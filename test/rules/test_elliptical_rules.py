@@ -11,9 +11,13 @@ import pytest
 from rules.examples import covariances
 from scipy.optimize import brentq, minimize
 
-from track_fusion.densities.elliptical import Family, generalized_gaussian, student_t
-from track_fusion.densities.projection import nearest_mean
-from track_fusion.densities.rao import informative_barycenter, minimal_manhattan_distance, rao_distance_scalar
+from track_fusion.densities.elliptical.elliptical import Family, generalized_gaussian, student_t
+from track_fusion.densities.elliptical.projection import nearest_mean
+from track_fusion.densities.elliptical.rao import (
+    informative_barycenter,
+    minimal_manhattan_distance,
+    rao_distance_scalar,
+)
 from track_fusion.linalg import Array
 from track_fusion.rules import FusedTracks, SourceTracks, get_rule
 

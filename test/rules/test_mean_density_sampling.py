@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from densities.test_mixture import draw
+from densities.mixture.test_mixture import draw
 from rules.test_mixture_averages import as_tracks
 
 from track_fusion.densities.mean_density import log_mean_density, sample_mean_density
-from track_fusion.densities.mixture import Mixture, log_pdf
-from track_fusion.densities.mixture_divergence import grid, moments_on_grid
+from track_fusion.densities.mixture.divergence import grid, moments_on_grid
+from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.linalg import Array
 from track_fusion.params import from_dict
 from track_fusion.rules import FusedTracks, SourceTracks, get_rule

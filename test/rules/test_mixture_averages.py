@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from densities.test_mixture import draw
+from densities.mixture.test_mixture import draw
 
-from track_fusion.densities.mixture import Mixture, moments
+from track_fusion.densities.mixture.mixture import Mixture, moments
 from track_fusion.rules import SourceTracks, get_rule
 
 KEYS = ("mixture_average", "mixture_geometric", "mixture_hybrid")

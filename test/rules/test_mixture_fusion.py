@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from densities.test_mixture import draw
+from densities.mixture.test_mixture import draw
 from rules.test_mixture_averages import as_tracks
 
 from track_fusion.densities.log_domain import normalised
-from track_fusion.densities.mixture import Mixture, log_pdf, moments, sample
-from track_fusion.densities.mixture_algebra import LogMixture, first_order, power, product
-from track_fusion.densities.mixture_sampling import Weighted, single_shot_em
+from track_fusion.densities.mixture.algebra import LogMixture, first_order, power, product
+from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments, sample
+from track_fusion.densities.mixture.sampling import Weighted, single_shot_em
 from track_fusion.linalg import Array
 from track_fusion.params import from_dict
 from track_fusion.rules import FusedTracks, SourceTracks, get_rule, mixture_common
-from track_fusion.scenarios.ahmed_mixtures import Problem, divergence, log_fused
-from track_fusion.scenarios.ahmed_random import study_problem
+from track_fusion.scenarios.ahmed.mixtures import Problem, divergence, log_fused
+from track_fusion.scenarios.ahmed.random import study_problem
 
 
 def run(key: str, tracks: SourceTracks, **values: Any) -> FusedTracks:
@@ -26,7 +26,7 @@ def run(key: str, tracks: SourceTracks, **values: Any) -> FusedTracks:
     return rule(tracks, from_dict(rule.params, values))
 
 
-# The random problems of Ahmed 5.1. The study itself: test/library/test_scenario_ahmed_mixtures.py.
+# The random problems of Ahmed 5.1. The study itself: test/scenarios/ahmed/test_mixtures.py.
 
 
 @pytest.fixture(scope="module")

@@ -8,12 +8,12 @@ from typing import Any
 import mpmath
 import numpy as np
 import pytest
-from densities.test_mixture import by_scipy, draw
+from densities.mixture.test_mixture import by_scipy, draw
 from rules.examples import rotated
 from rules.test_mixture_averages import as_tracks
 from scipy import integrate
 
-from track_fusion.densities.mixture import Mixture
+from track_fusion.densities.mixture.mixture import Mixture
 from track_fusion.linalg import Array
 from track_fusion.params import from_dict
 from track_fusion.rules import FusedTracks, SourceTracks, get_rule

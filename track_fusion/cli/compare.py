@@ -14,7 +14,7 @@ from track_fusion.params import ParameterError
 if TYPE_CHECKING:
     from track_fusion.metrics.significance import Difference
     from track_fusion.scenarios import Samples, Scenario
-    from track_fusion.scenarios.study import RuleSpec
+    from track_fusion.study.runs import RuleSpec
 
 
 @click.command(short_help="Compare fusion rules on a published scenario.")
@@ -43,8 +43,8 @@ def compare(name: str, rules: str, params: str, runs: int | None, seed: int, job
     from track_fusion.cli.output import print_json
     from track_fusion.cli.progress import studies
     from track_fusion.metrics.significance import paired_differences
-    from track_fusion.scenarios.study import Work, choice
-    from track_fusion.scenarios.user_files import find_scenario
+    from track_fusion.scenarios import find_scenario
+    from track_fusion.study.runs import Work, choice
 
     scenario = find_scenario(name)
     if scenario.compare is None:
@@ -54,7 +54,7 @@ def compare(name: str, rules: str, params: str, runs: int | None, seed: int, job
     if len({c.name for c in chosen}) < len(chosen):
         raise ParameterError(f"The '--rules' must differ. Got {rules}.")
     count = (runs or scenario.default_runs) if scenario.random else 1
-    (study,) = studies([Work(name, count, seed, rules=specs)], jobs or os.cpu_count() or 1, None)
+    (study,) = studies([Work(name, find_scenario, count, seed, rules=specs)], jobs or os.cpu_count() or 1, None)
     groups = by_filter_and_quantity(study.samples)
     differences = {group: paired_differences(scores) for group, scores in groups.items()}
     if as_json:
@@ -70,8 +70,8 @@ def rule_specs(rules: str, params: str) -> tuple[RuleSpec, ...]:
     ------
     ParameterError    not JSON of the right form, or parameters of a rule that is not named
     """
-    from track_fusion.scenarios.study import RuleSpec
-    from track_fusion.scenarios.user_files import is_path
+    from track_fusion.plugins import is_path
+    from track_fusion.study.runs import RuleSpec
 
     try:
         given = json.loads(params)

@@ -42,7 +42,7 @@ def fuse(rule: str, params: str) -> None:
     from track_fusion.cli.output import print_json
     from track_fusion.cli.tracks_json import read_tracks, write_fused
     from track_fusion.params import from_dict
-    from track_fusion.scenarios.user_files import find_rule
+    from track_fusion.rules import find_rule
 
     chosen = find_rule(rule)
     settings = from_dict(chosen.params, _read_params(params))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from track_fusion.scenarios.study import Study, Work
+    from track_fusion.study.runs import Study, Work
 
 
 def studies(works: Sequence[Work], jobs: int, store: Path | None) -> Iterator[Study]:
@@ -16,7 +16,7 @@ def studies(works: Sequence[Work], jobs: int, store: Path | None) -> Iterator[St
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     from track_fusion.cli.output import console
-    from track_fusion.scenarios.study import run_studies
+    from track_fusion.study.runs import run_studies
 
     err = console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from track_fusion.scenarios import Scenario
-    from track_fusion.scenarios.study import Study
+    from track_fusion.study.runs import Study
 
 #: Colours of the verdicts in the table.
 STYLES = {"agrees": "green", "ordering only": "yellow", "does not reproduce": "red", "not given": "dim"}
@@ -62,9 +62,8 @@ def reproduce(
     """  # noqa: D301  click reads \b as "do not wrap"
     from track_fusion.cli.output import print_json
     from track_fusion.cli.progress import studies
-    from track_fusion.scenarios import SCENARIOS
-    from track_fusion.scenarios.study import Work
-    from track_fusion.scenarios.user_files import find_scenario
+    from track_fusion.scenarios import SCENARIOS, find_scenario
+    from track_fusion.study.runs import Work
 
     if bool(names) == every:
         raise click.UsageError("Give names of scenarios, or --all.")
@@ -79,7 +78,7 @@ def reproduce(
     import matplotlib  # noqa: F401  the page needs it: better missing now than after the work
 
     chosen = tuple(SCENARIOS) if every else tuple(dict.fromkeys(names))
-    works = [Work(name, wanted(find_scenario(name)), seed, only) for name in chosen]
+    works = [Work(name, find_scenario, wanted(find_scenario(name)), seed, only) for name in chosen]
     found = []
     for study in studies(works, jobs or os.cpu_count() or 1, out / "pieces"):
         found.append((study, _result(study)))
@@ -95,8 +94,7 @@ def reproduce(
 
 def _result(study: Study) -> dict[str, Any]:
     """Judge a study; what --json prints."""
-    from track_fusion.scenarios import judged_claims, judged_figures
-    from track_fusion.scenarios.user_files import find_scenario
+    from track_fusion.scenarios import find_scenario, judged_claims, judged_figures
 
     scenario, work = find_scenario(study.work.scenario), study.work
     measured = scenario.figures(study.samples)
@@ -116,7 +114,7 @@ def _write(out: Path, found: list[tuple[Study, dict[str, Any]]]) -> None:
     from track_fusion.cli.app import version
     from track_fusion.cli.output import plain
     from track_fusion.report.page import Section, page
-    from track_fusion.scenarios.user_files import find_scenario
+    from track_fusion.scenarios import find_scenario
 
     sections = []
     for study, result in found:

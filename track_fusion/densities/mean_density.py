@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 
 from track_fusion.densities.log_domain import log_of, log_sum_exp
-from track_fusion.densities.mixture import Factored, Mixture, sample
-from track_fusion.densities.mixture_algebra import LogMixture, average
-from track_fusion.densities.mixture_sampling import Weighted, single_shot_em
+from track_fusion.densities.mixture.algebra import LogMixture, average
+from track_fusion.densities.mixture.mixture import Factored, Mixture, sample
+from track_fusion.densities.mixture.sampling import Weighted, single_shot_em
 from track_fusion.linalg import Array
 
 Kind = Literal["harmonic", "geometric"]

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from track_fusion.densities.mixture import Mixture, moments
-from track_fusion.densities.mixture_reduction import runnalls
+from track_fusion.densities.mixture.mixture import Mixture, moments
+from track_fusion.densities.mixture.reduction import runnalls
 from track_fusion.filters import extended
 from track_fusion.filters.interacting_multiple_model import check_chain, mixing, reweighted
 from track_fusion.filters.iterated_corrector import GaussianUpdate

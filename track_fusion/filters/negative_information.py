@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from track_fusion.densities.log_domain import log_of
-from track_fusion.densities.mixture import Mixture
+from track_fusion.densities.mixture.mixture import Mixture
 from track_fusion.linalg import Array, cholesky, inverse, matvec, outer, solve, symmetrise, transpose
 from track_fusion.models.detection import SoftmaxDetector
 

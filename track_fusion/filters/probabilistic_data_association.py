@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.chi_square import chi_square_quantile
 from track_fusion.filters.interacting_multiple_model import reweighted
 from track_fusion.linalg import Array, logdet, matvec, outer, solve, symmetrise, transpose
 from track_fusion.models.base import Sensor
 from track_fusion.params import Params, param
+from track_fusion.solvers.chi_square import chi_square_quantile
 
 
 @dataclasses.dataclass(frozen=True)

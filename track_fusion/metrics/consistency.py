@@ -6,8 +6,8 @@ import dataclasses
 
 import numpy as np
 
-from track_fusion.chi_square import chi_square_quantile
 from track_fusion.linalg import Array, mahalanobis_squared
+from track_fusion.solvers.chi_square import chi_square_quantile
 
 #: Two-sided probability of the bounds.
 CONFIDENCE = 0.95

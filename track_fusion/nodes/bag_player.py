@@ -7,16 +7,10 @@ import importlib
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from rosgraph_msgs.msg import Clock as ClockMessage
-
-from msg_adapters.header import stamp_from_ns
-from track_fusion.nodes.managed import Fault, qos
+from track_fusion.nodes.managed import Fault, ManagedNode, qos
 from track_fusion.params import ParameterError, Params, param
-
-if TYPE_CHECKING:
-    from track_fusion.nodes.replay import ReplayNode
 
 SECOND_NS = 1_000_000_000
 #: At most this much bag time passes between two /clock messages, wall time permitting.
@@ -76,14 +70,17 @@ class BagPlayer:
 
     Parameters
     ----------
-    node : ReplayNode
+    node : ManagedNode
+    tell_time : callable    publishes /clock, ns
     path : str           rosbag2 directory
     params : BagParams
     rate : float         bag seconds a wall second
     """
 
-    def __init__(self, node: ReplayNode, path: str, params: BagParams, rate: float) -> None:
-        self._node, self._params, self._rate = node, params, rate
+    def __init__(
+        self, node: ManagedNode, tell_time: Callable[[int], None], path: str, params: BagParams, rate: float
+    ) -> None:
+        self._node, self._tell_time, self._params, self._rate = node, tell_time, params, rate
         self._reader = open_bag(path)
         names = dict(self._split(r) for r in params.remaps)
         played = [
@@ -144,6 +141,3 @@ class BagPlayer:
             else:
                 self._timer.cancel()
                 self._finish()
-
-    def _tell_time(self, now_ns: int) -> None:
-        self._node._clock_out.publish(ClockMessage(clock=stamp_from_ns(now_ns)))

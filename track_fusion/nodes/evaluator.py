@@ -12,10 +12,10 @@ from sensor_msgs.msg import PointCloud2
 
 from msg_adapters.odometry import odometry_from_msg
 from msg_adapters.track_table import track_table_from_msg
-from track_fusion.evaluation import Evaluation, EvaluationParams
-from track_fusion.nodes.frames import FrameParams, screened_tracks
+from track_fusion.metrics.evaluation import Evaluation, EvaluationParams
 from track_fusion.nodes.managed import ManagedNode, end, run
 from track_fusion.nodes.ros_params import declare
+from track_fusion.nodes.screening import FrameParams, screened_tracks
 from track_fusion.params import Params, param
 from track_fusion.tracks import StateLayout
 
@@ -29,7 +29,7 @@ class EvaluatorParams(Params):
 
 
 class EvaluatorNode(ManagedNode):
-    """Carries messages to a :class:`track_fusion.evaluation.Evaluation`."""
+    """Carries messages to a :class:`track_fusion.metrics.evaluation.Evaluation`."""
 
     def declare_parameters_(self) -> None:
         """Declare parameters."""

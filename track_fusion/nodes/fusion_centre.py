@@ -17,16 +17,16 @@ from msg_adapters.header import check_header
 from msg_adapters.markers import markers_to_msg
 from msg_adapters.odometry import CrossBlock, odometry_from_msg, odometry_to_msgs
 from msg_adapters.track_table import track_table_from_msg, track_table_to_msg
-from track_fusion.fusion_centre import FusionCentre, FusionCentreParams, StepInfo
+from track_fusion.centre.centre import FusionCentre, FusionCentreParams, StepInfo
+from track_fusion.centre.scan_buffer import ScanBuffer, ScanBufferParams
+from track_fusion.centre.track_manager import TrackManagerParams
 from track_fusion.models.choices import MOTIONS, MotionChoice
-from track_fusion.nodes.frames import FrameParams, screened_tracks
 from track_fusion.nodes.managed import ManagedNode, end, run
 from track_fusion.nodes.ros_params import chosen, declare
+from track_fusion.nodes.screening import FrameParams, screened_tracks
 from track_fusion.params import ParameterError, Params, param
 from track_fusion.random_streams import RandomParams
 from track_fusion.rules import RULES
-from track_fusion.scan_buffer import ScanBuffer, ScanBufferParams
-from track_fusion.track_manager import TrackManagerParams
 from track_fusion.tracks import StateLayout, TrackBatch
 
 #: Provenance has 32 bits.
@@ -76,7 +76,7 @@ class SourceParams(Params):
 
 
 class FusionCentreNode(ManagedNode):
-    """Carries messages to a :class:`track_fusion.fusion_centre.FusionCentre`; steps as the scan buffer says."""
+    """Carries messages to a :class:`track_fusion.centre.centre.FusionCentre`; steps as the scan buffer says."""
 
     def declare_parameters_(self) -> None:
         """Declare parameters and build the centre."""

@@ -94,7 +94,7 @@ class ReplayNode(ManagedNode):
         """Create the topics."""
         self._clock_out = self.create_publisher(ClockMessage, "/clock", qos(10))
         if self.params.bag:
-            self._player = BagPlayer(self, self.params.bag, self.bag, self.params.rate)
+            self._player = BagPlayer(self, self._tell_time, self.params.bag, self.bag, self.params.rate)
             self._wanted = dict.fromkeys(self._player.publishers, self.params.expected_subscribers_each)
         else:
             self._connect_scenario()
@@ -134,7 +134,7 @@ class ReplayNode(ManagedNode):
             self._next()
         elif self.params.pace == "lockstep" and not self.params.bag:
             if not self.counted["results"]:  # a participant may have met our clock after our first message
-                self._tell_time()
+                self._tell_time(self._stamp_ns())
             self._check_deadline(f"no result of step {self._step} on {self._fused.topic_name}. {self._network()}")
 
     def _check_deadline(self, what: str) -> None:
@@ -177,12 +177,12 @@ class ReplayNode(ManagedNode):
     def _stamp_ns(self) -> int:
         return round(self._step * self._scene.dt_s * SECOND_NS)
 
-    def _tell_time(self) -> None:
-        self._clock_out.publish(ClockMessage(clock=stamp_from_ns(self._stamp_ns())))
+    def _tell_time(self, now_ns: int) -> None:
+        self._clock_out.publish(ClockMessage(clock=stamp_from_ns(now_ns)))
 
     def _publish_step(self, step: int) -> None:
         stamp_ns = self._stamp_ns()
-        self._tell_time()
+        self._tell_time(stamp_ns)
         layout, states = self._scene.layout, self._states[step]
         there = np.flatnonzero(np.isfinite(states).all(1))
         sharp = np.tile(TRUTH_VARIANCE * np.eye(layout.size), (len(there), 1, 1))

@@ -16,19 +16,19 @@ from msg_adapters.odometry import odometry_to_msgs
 from msg_adapters.track_table import track_table_from_msg, track_table_to_msg
 from track_fusion.models.choices import MOTIONS, SENSORS
 from track_fusion.models.measurement import RangeBearingSensor
-from track_fusion.nodes.frames import FrameParams, screened_detections, screened_tracks
 from track_fusion.nodes.managed import ManagedNode, end, run
 from track_fusion.nodes.ros_params import chosen, declare
+from track_fusion.nodes.screening import FrameParams, screened_detections, screened_tracks
 from track_fusion.params import ParameterError, Params, param
-from track_fusion.pda_tracker import PdaTracker, PdaTrackerParams
-from track_fusion.sensor_tracker import (
+from track_fusion.trackers.filters import TRACK_FILTERS
+from track_fusion.trackers.many_targets import PdaTracker, PdaTrackerParams
+from track_fusion.trackers.one_target import (
     MULTI_TARGET,
     LostTrackError,
     SensorTracker,
     SensorTrackerParams,
     TrackerChoice,
 )
-from track_fusion.track_filters import TRACK_FILTERS
 from track_fusion.tracks import StateLayout, TrackBatch
 
 #: How often a tracker that waits for feedback looks at its deadline.
@@ -57,7 +57,7 @@ class OutputParams(Params):
 
 
 class SensorTrackerNode(ManagedNode):
-    """Carries messages to a :class:`track_fusion.sensor_tracker.SensorTracker`, or a multi-target tracker.
+    """Carries messages to a :class:`track_fusion.trackers.one_target.SensorTracker`, or a multi-target tracker.
 
     With feedback, a scan waits until the fused posterior of the scan before has come back, so that late feedback
     changes nothing.

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from track_fusion.report.chart import Chart, Contours, Series
+from track_fusion.study.chart import Chart, Contours, Series
 
 #: Inches; one chart is a column of a narrow screen.
 WIDTH, HEIGHT, LEGEND_ROW = 5.2, 3.7, 0.22

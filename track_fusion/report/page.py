@@ -9,9 +9,9 @@ from html import escape
 from math import floor, isnan, log10
 from typing import Any, NamedTuple
 
-from track_fusion.report.chart import Chart
 from track_fusion.report.drawing import svg
-from track_fusion.scenarios.base import Printed, Scenario
+from track_fusion.study.chart import Chart
+from track_fusion.study.scenario import Printed, Scenario
 
 VERDICTS = ("agrees", "ordering only", "does not reproduce", "not given")
 #: Units whose names in figures lack signs.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from track_fusion.params import unknown_name_error
+from track_fusion.params import ParameterError, unknown_name_error
+from track_fusion.plugins import from_file, is_path
 from track_fusion.rules import (
     arithmetic_average,
     covariance_intersection,
@@ -70,4 +71,19 @@ def get_rule(key: str) -> Rule:
     return RULES[key]
 
 
-__all__ = ["RULES", "FusedTracks", "Mixture", "Rule", "SourceTracks", "get_rule"]
+def find_rule(name: str) -> Rule:
+    """Return the rule of a key, or the RULE that a Python file defines, which is then known by its key, too.
+
+    Raises
+    ------
+    ParameterError    there is none, or the file's key is that of another rule
+    """
+    if not is_path(name):
+        return get_rule(name)
+    rule = from_file(name, "RULE", Rule)
+    if RULES.setdefault(rule.key, rule) is not rule:
+        raise ParameterError(f"The rule of {name} must have a key of its own. Got '{rule.key}', which is taken.")
+    return rule
+
+
+__all__ = ["RULES", "FusedTracks", "Mixture", "Rule", "SourceTracks", "find_rule", "get_rule"]

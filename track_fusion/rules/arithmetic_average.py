@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from track_fusion.densities.bound_weights import bound_weights
 from track_fusion.densities.gaussian import merge, merge_near
-from track_fusion.densities.merging_weights import merging_weights
-from track_fusion.densities.mixture_algebra import average
+from track_fusion.densities.mixture.algebra import average
 from track_fusion.linalg import Array
-from track_fusion.optimise import Solution
 from track_fusion.params import Params, param
 from track_fusion.rules.base import FusedTracks, Mixture, Rule, SourceTracks, check_weights
+from track_fusion.solvers.optimise import Solution
+from track_fusion.weights.bound import bound_weights
+from track_fusion.weights.merging import merging_weights
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from track_fusion.densities.mixture import Mixture as Mixture
+from track_fusion.densities.mixture.mixture import Mixture as Mixture
 from track_fusion.linalg import Array, asymmetric, is_positive_definite, symmetrise
 from track_fusion.params import Params
 

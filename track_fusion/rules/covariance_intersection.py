@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.gaussian import keep_sole, weighted_product
-from track_fusion.densities.pair import FEW, SHARP, Pair, SinglePair
 from track_fusion.linalg import Array, inverse, matvec, outer, symmetrise, transpose
-from track_fusion.optimise import (
+from track_fusion.params import Params, param
+from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
+from track_fusion.solvers.optimise import (
     Derivatives,
     ScalarDerivatives,
     Solution,
@@ -18,8 +19,7 @@ from track_fusion.optimise import (
     minimise_on_simplex,
     minimise_one,
 )
-from track_fusion.params import Params, param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
+from track_fusion.solvers.pair import FEW, SHARP, Pair, SinglePair
 
 #: Large batches are worked on in pieces whose arrays stay in the cache.
 PAIR_CHUNK, MANY_CHUNK = 1024, 512

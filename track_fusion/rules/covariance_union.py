@@ -7,11 +7,11 @@ from typing import Literal, cast
 
 import numpy as np
 
-from track_fusion.densities.merging_weights import merging_weights
-from track_fusion.densities.upper_bound import Bound, bound_about, bound_anywhere
 from track_fusion.linalg import Array, outer
 from track_fusion.params import Params, param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
+from track_fusion.solvers.upper_bound import Bound, bound_about, bound_anywhere
+from track_fusion.weights.merging import merging_weights
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,11 +6,11 @@ import dataclasses
 
 import numpy as np
 
-from track_fusion.densities.pair import Pair
 from track_fusion.linalg import Array
 from track_fusion.params import Params
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
 from track_fusion.rules.pairwise import PairFusion, fold
+from track_fusion.solvers.pair import Pair
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,8 +6,8 @@ import dataclasses
 
 import numpy as np
 
-from track_fusion.densities.elliptical import Family, gaussian, generalized_gaussian, student_t
-from track_fusion.densities.projection import ProjectionMean, nearest_mean
+from track_fusion.densities.elliptical.elliptical import Family, gaussian, generalized_gaussian, student_t
+from track_fusion.densities.elliptical.projection import ProjectionMean, nearest_mean
 from track_fusion.linalg import Array
 from track_fusion.params import Params, param
 from track_fusion.rules.base import SourceTracks

@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 
 from track_fusion.densities.gaussian import weighted_product
-from track_fusion.densities.pooling_weights import chernoff_weights
 from track_fusion.params import Params
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
+from track_fusion.weights.pooling import chernoff_weights
 
 
 @dataclasses.dataclass(frozen=True)

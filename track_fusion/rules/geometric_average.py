@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 
 from track_fusion.densities.gaussian import weighted_product
-from track_fusion.densities.pooling_weights import chernoff_weights, minimax_weights
 from track_fusion.params import Params, param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
+from track_fusion.weights.pooling import chernoff_weights, minimax_weights
 
 
 @dataclasses.dataclass(frozen=True)

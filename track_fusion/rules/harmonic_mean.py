@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.mean_density import fit_mean_density, sample_mean_density
-from track_fusion.densities.merging_weights import pair_derivatives
-from track_fusion.densities.mixture import Mixture, chosen, moments, same, stacked
-from track_fusion.densities.mixture_algebra import LogMixture, product
-from track_fusion.densities.pair import Pair
+from track_fusion.densities.mixture.algebra import LogMixture, product
+from track_fusion.densities.mixture.mixture import Mixture, chosen, moments, same, stacked
 from track_fusion.linalg import Array, matvec, outer, transpose
-from track_fusion.optimise import Derivatives, Solution, minimise_on_interval
 from track_fusion.params import param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
 from track_fusion.rules.mixture_common import Generators, ReductionParams, Step, fold_mixtures, fuse_sampled
 from track_fusion.rules.pairwise import PairFusion, fold, share_of_first
+from track_fusion.solvers.optimise import Derivatives, Solution, minimise_on_interval
+from track_fusion.solvers.pair import Pair
+from track_fusion.weights.merging import pair_derivatives
 
 
 @dataclasses.dataclass(frozen=True)

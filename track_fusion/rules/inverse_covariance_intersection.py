@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.pair import Pair
 from track_fusion.linalg import Array
-from track_fusion.optimise import Derivatives, Solution, minimise_on_interval
 from track_fusion.params import Params, param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
 from track_fusion.rules.pairwise import PairFusion, fold
+from track_fusion.solvers.optimise import Derivatives, Solution, minimise_on_interval
+from track_fusion.solvers.pair import Pair
 
 
 @dataclasses.dataclass(frozen=True)

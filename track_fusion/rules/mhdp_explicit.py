@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from track_fusion.densities.spd_means import log_euclidean_mean
+from track_fusion.densities.elliptical.spd_means import log_euclidean_mean
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
 from track_fusion.rules.elliptical_tracks import MhdpParams, family_of, projected
 

@@ -6,8 +6,8 @@ import dataclasses
 
 import numpy as np
 
+from track_fusion.densities.elliptical.spd_means import karcher_mean
 from track_fusion.densities.gaussian import weighted_product
-from track_fusion.densities.spd_means import karcher_mean
 from track_fusion.params import param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
 from track_fusion.rules.elliptical_tracks import MhdpParams, family_of, projected

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from track_fusion.densities.mixture_algebra import average
+from track_fusion.densities.mixture.algebra import average
 from track_fusion.params import param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
 from track_fusion.rules.mixture_common import ReductionParams, average_weights, fused_tracks

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.mixture import Mixture, chosen, moments, padded, same
-from track_fusion.densities.mixture_algebra import LogMixture, power, product
-from track_fusion.densities.mixture_reduction import REDUCTIONS, prune
+from track_fusion.densities.mixture.algebra import LogMixture, power, product
+from track_fusion.densities.mixture.mixture import Mixture, chosen, moments, padded, same
+from track_fusion.densities.mixture.reduction import REDUCTIONS, prune
 from track_fusion.linalg import Array, is_positive_definite
 from track_fusion.params import Params, param
 from track_fusion.rules.base import FusedTracks, SourceTracks, check_weights

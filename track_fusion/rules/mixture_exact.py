@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.log_domain import log_sum_exp, normalised
-from track_fusion.densities.mixture import Factored, Mixture, chosen, moments, same, sample
-from track_fusion.densities.mixture_algebra import LogMixture, product
-from track_fusion.densities.mixture_proposals import (
+from track_fusion.densities.mixture.algebra import LogMixture, product
+from track_fusion.densities.mixture.mixture import Factored, Mixture, chosen, moments, same, sample
+from track_fusion.densities.mixture.proposals import (
     MOST_SPREAD,
     indirect_global_sampling,
     laplace_proposal,
     prune_mixands,
 )
-from track_fusion.densities.mixture_quotient import (
+from track_fusion.densities.mixture.quotient import (
     Bound,
     Laplace,
     Quotient,
@@ -28,7 +28,7 @@ from track_fusion.densities.mixture_quotient import (
     moment_matched,
     not_integrable,
 )
-from track_fusion.densities.mixture_sampling import Weighted, weighted_em
+from track_fusion.densities.mixture.sampling import Weighted, weighted_em
 from track_fusion.linalg import Array, asymmetric, is_positive_definite
 from track_fusion.params import param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.mixture import Mixture
-from track_fusion.densities.mixture_proposals import (
+from track_fusion.densities.mixture.mixture import Mixture
+from track_fusion.densities.mixture.proposals import (
     Pruned,
     direct_local_sampling,
     heavy_tail,
     inflated_naive,
     laplace_proposals,
 )
-from track_fusion.densities.mixture_quotient import Laplace
+from track_fusion.densities.mixture.quotient import Laplace
 from track_fusion.linalg import Array
 from track_fusion.params import param
 from track_fusion.rules.base import SourceTracks

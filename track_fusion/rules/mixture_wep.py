@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from track_fusion.densities.gaussian import weighted_product
 from track_fusion.densities.log_domain import log_of, log_sum_exp, normalised
-from track_fusion.densities.mixture import Mixture, chosen, same, stacked
-from track_fusion.densities.mixture_algebra import LogMixture, first_order, product
-from track_fusion.densities.mixture_proposals import prune_mixands
-from track_fusion.densities.mixture_quotient import Laplace, laplace, wep_bound, wep_quotient
-from track_fusion.densities.mixture_sampling import (
+from track_fusion.densities.mixture.algebra import LogMixture, first_order, product
+from track_fusion.densities.mixture.mixture import Mixture, chosen, same, stacked
+from track_fusion.densities.mixture.proposals import prune_mixands
+from track_fusion.densities.mixture.quotient import Laplace, laplace, wep_bound, wep_quotient
+from track_fusion.densities.mixture.sampling import (
     PROPOSAL_OMEGA,
     Omega,
     optimise_omega,
@@ -24,7 +24,6 @@ from track_fusion.densities.mixture_sampling import (
     single_shot_em,
     weighted_em,
 )
-from track_fusion.densities.pooling_weights import chernoff_weights, minimax_weights
 from track_fusion.linalg import Array
 from track_fusion.params import param
 from track_fusion.rules import covariance_intersection
@@ -40,6 +39,7 @@ from track_fusion.rules.mixture_common import (
 )
 from track_fusion.rules.mixture_quotients import QuotientParams, sample_mixands
 from track_fusion.rules.pairwise import share_of_first
+from track_fusion.weights.pooling import chernoff_weights, minimax_weights
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,13 +7,13 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from track_fusion.densities.elliptical.rao import manhattan_paths
 from track_fusion.densities.gaussian import weighted_product
-from track_fusion.densities.rao import manhattan_paths
-from track_fusion.least_squares import minimise_squares_on_simplex
 from track_fusion.linalg import Array, inverse, matvec, symmetrise, transpose
-from track_fusion.optimise import Solution
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
 from track_fusion.rules.elliptical_tracks import EllipticalParams, family_of
+from track_fusion.solvers.least_squares import minimise_squares_on_simplex
+from track_fusion.solvers.optimise import Solution
 
 #: A search that starts from one track gives it this weight.
 LEAN = 0.9

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.linalg import Array, inverse, matvec, symmetrise, transpose
-from track_fusion.optimise import GradientHessian, minimise_on_simplex
 from track_fusion.params import Params, param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
+from track_fusion.solvers.optimise import GradientHessian, minimise_on_simplex
 
 #: An independent part may leave the range from nothing to the covariance by this share of that: rounding.
 ROUNDING = 1e-9

@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 from track_fusion.params import unknown_name_error
-from track_fusion.scenarios import (
-    ahmed_maneuver,
-    ahmed_proposals,
-    ahmed_random,
-    ahmed_search,
-    chen2022_dynamic_1,
-    chen2022_dynamic_2,
-    chen2022_static,
-    li2019_densities,
-    li2019_mixture,
-    li2019_six_sensors,
-    li2019_variables,
-    li2022_four_cases,
-    li2022_linear,
-    li2022_nonlinear,
-    li2022_target_fit,
-    sharma_gaussians,
-    sharma_mixtures,
-    sharma_network_1,
-    sharma_network_2,
-    sharma_radars,
-    sharma_scalar,
-)
-from track_fusion.scenarios.base import (
+from track_fusion.plugins import from_file, is_path
+from track_fusion.scenarios.ahmed import maneuver as ahmed_maneuver
+from track_fusion.scenarios.ahmed import proposals as ahmed_proposals
+from track_fusion.scenarios.ahmed import random as ahmed_random
+from track_fusion.scenarios.ahmed import search as ahmed_search
+from track_fusion.scenarios.chen2022 import dynamic_1 as chen2022_dynamic_1
+from track_fusion.scenarios.chen2022 import dynamic_2 as chen2022_dynamic_2
+from track_fusion.scenarios.chen2022 import static as chen2022_static
+from track_fusion.scenarios.li2019 import densities as li2019_densities
+from track_fusion.scenarios.li2019 import mixture as li2019_mixture
+from track_fusion.scenarios.li2019 import six_sensors as li2019_six_sensors
+from track_fusion.scenarios.li2019 import variables as li2019_variables
+from track_fusion.scenarios.li2022 import four_cases as li2022_four_cases
+from track_fusion.scenarios.li2022 import linear as li2022_linear
+from track_fusion.scenarios.li2022 import nonlinear as li2022_nonlinear
+from track_fusion.scenarios.li2022 import target_fit as li2022_target_fit
+from track_fusion.scenarios.sharma import gaussians as sharma_gaussians
+from track_fusion.scenarios.sharma import mixtures as sharma_mixtures
+from track_fusion.scenarios.sharma import network_1 as sharma_network_1
+from track_fusion.scenarios.sharma import network_2 as sharma_network_2
+from track_fusion.scenarios.sharma import radars as sharma_radars
+from track_fusion.scenarios.sharma import scalar as sharma_scalar
+from track_fusion.study.judgement import judged_claims, judged_figures
+from track_fusion.study.scenario import (
     Claim,
     RuleChoice,
     Samples,
@@ -34,7 +34,6 @@ from track_fusion.scenarios.base import (
     Scene,
     Tracking,
 )
-from track_fusion.scenarios.judgement import judged_claims, judged_figures
 
 _MODULES = (
     li2022_linear,
@@ -75,6 +74,16 @@ def get_scenario(key: str) -> Scenario:
     return SCENARIOS[key]
 
 
+def find_scenario(name: str) -> Scenario:
+    """Return the scenario of a key, or the SCENARIO that a Python file defines.
+
+    Raises
+    ------
+    ParameterError    there is none
+    """
+    return from_file(name, "SCENARIO", Scenario) if is_path(name) else get_scenario(name)
+
+
 __all__ = [
     "SCENARIOS",
     "Claim",
@@ -83,6 +92,7 @@ __all__ = [
     "Scenario",
     "Scene",
     "Tracking",
+    "find_scenario",
     "get_scenario",
     "judged_claims",
     "judged_figures",

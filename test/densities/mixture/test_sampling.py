@@ -1,0 +1,252 @@
+"""Algorithms 1 to 5 of Ahmed, each by itself: against quadrature, within their Monte Carlo error, seeded."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from densities.mixture.test_mixture import draw
+from densities.mixture.test_quotient import COMMON, FIRST, SECOND, mixand_moments
+from scipy import integrate
+from scipy.optimize import minimize_scalar
+
+from track_fusion.densities.mixture.divergence import grid, kl_on_grid, moments_on_grid
+from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments, sample
+from track_fusion.densities.mixture.proposals import (
+    Proposal,
+    direct_local_sampling,
+    heavy_tail,
+    indirect_global_sampling,
+    inflated_naive,
+    laplace_proposal,
+    laplace_proposals,
+    prune_mixands,
+)
+from track_fusion.densities.mixture.quotient import exact_bound, exact_quotient, laplace, wep_quotient
+from track_fusion.densities.mixture.sampling import (
+    Weighted,
+    floored,
+    optimise_omega,
+    single_shot_em,
+    weighted_em,
+)
+from track_fusion.linalg import Array
+
+POINTS = grid(np.array([-40.0]), np.array([40.0]), 4000)
+
+
+def _log(mixture: Mixture) -> Array:
+    return log_pdf(mixture, POINTS)
+
+
+def _integral(log_density: Array) -> float:
+    return float(np.exp(log_density).sum() * 80.0 / 4000)
+
+
+# Algorithm 1.
+
+
+def _exact_omega(criterion: str) -> float:
+    a, b = _log(FIRST), _log(SECOND)
+    naive = np.exp(a + b) / np.exp(a + b).sum()
+    pull = 0.0 if criterion == "chernoff" else float((naive * (b - a)).sum())
+    return float(minimize_scalar(
+        lambda w: w * pull + np.log(_integral(w * a + (1 - w) * b)), bounds=(0, 1), method="bounded"
+    ).x)  # fmt: skip
+
+
+@pytest.mark.parametrize("criterion", ["chernoff", "minimax_information_loss"])
+def test_omega_is_that_of_quadrature(criterion: str) -> None:
+    found = optimise_omega(FIRST, SECOND, np.random.default_rng(0), 40000, criterion)
+    assert found.converged
+    assert found.omega == pytest.approx(_exact_omega(criterion), abs=0.04)  # four standard errors of 40000 samples
+    w = float(found.omega)
+    wanted = np.log(_integral(w * _log(FIRST) + (1 - w) * _log(SECOND)))
+    assert found.samples.log_eta == pytest.approx(wanted, abs=0.01)
+    mean, cov = moments_on_grid(lambda x: w * log_pdf(FIRST, x) + (1 - w) * log_pdf(SECOND, x), POINTS)
+    got = found.samples.moments()
+    assert got[0][0] == pytest.approx(mean[0], abs=4 * np.sqrt(cov[0, 0] / float(found.samples.ess)))
+    assert got[1][0, 0] == pytest.approx(cov[0, 0], rel=0.05)
+
+
+def test_chernoff_point_is_equally_far_from_both() -> None:
+    """Ahmed (10), which the paper gives as necessary and sufficient."""
+    w = float(optimise_omega(FIRST, SECOND, np.random.default_rng(0), 40000).omega)
+
+    def fused(x: Array) -> Array:
+        return w * log_pdf(FIRST, x) + (1 - w) * log_pdf(SECOND, x)
+
+    far = [kl_on_grid(fused, lambda x, m=m: log_pdf(m, x), POINTS) for m in (FIRST, SECOND)]
+    assert far[0] == pytest.approx(far[1], rel=0.2)
+
+
+def test_importance_weights_of_algorithm_1_are_bounded_at_one_half() -> None:
+    """The square root of a sum is no more than the sum of square roots: target over proposal is at most its mass."""
+    rng = np.random.default_rng(1)
+    first, second = draw(rng, 20, count=4), draw(rng, 20, count=3)
+    found = optimise_omega(first, second, rng, 2000, omega=np.full(20, 0.5))
+    assert (found.samples.log_weight.max(-1) - found.samples.log_eta < np.log(2 * 2 * 12)).all()
+    assert (found.samples.ess > 0.4 * 2000).all()
+
+
+# Algorithm 2.
+
+
+def test_weighted_em_recovers_a_mixture_from_weighted_samples() -> None:
+    truth = Mixture(
+        np.array([0.3, 0.7]), np.array([[-4.0, 0.0], [3.0, 1.0]]), np.stack([np.eye(2), np.diag([1.0, 4.0])])
+    )
+    wide = Mixture(np.ones(1), np.zeros((1, 2)), 20.0 * np.eye(2)[None])
+    points = sample(wide, np.random.default_rng(0), 8000).points
+    learned = weighted_em(Weighted(points, log_pdf(truth, points) - log_pdf(wide, points)), 2, np.random.default_rng(1))
+    assert learned.converged
+    order = np.argsort(learned.mixture.weight)
+    np.testing.assert_allclose(learned.mixture.weight[order], truth.weight, atol=0.03)
+    np.testing.assert_allclose(learned.mixture.mean[order], truth.mean, atol=0.15)
+    np.testing.assert_allclose(learned.mixture.cov[order], truth.cov, atol=0.3)
+
+
+def test_weighted_em_does_not_depend_on_the_batch() -> None:
+    rng = np.random.default_rng(2)
+    mixture = draw(rng, 3, count=3)
+    points = sample(mixture, rng, 300).points
+    whole = weighted_em(Weighted(points, np.zeros((3, 300))), 3, np.random.default_rng(0))
+    alone = weighted_em(Weighted(points[1], np.zeros(300)), 3, np.random.default_rng(0))
+    np.testing.assert_allclose(alone.mixture.mean, whole.mixture.mean[1], rtol=1e-12)
+    assert alone.iterations == whole.iterations[1]
+
+
+# Algorithm 3.
+
+
+def test_single_shot_em_keeps_the_moments_of_the_samples() -> None:
+    quotient = exact_quotient(FIRST, SECOND, COMMON)
+    proposal = laplace_proposal(quotient)
+    drawn = indirect_global_sampling(quotient, proposal, np.random.default_rng(0), 500, floor=0.0)
+    for got, wanted in zip(moments(drawn.mixture), drawn.samples.moments(), strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=1e-10)
+
+
+def test_single_shot_em_survives_mixands_without_samples() -> None:
+    quotient = exact_quotient(FIRST, SECOND, COMMON)
+    far = quotient.numerator._replace(mean=quotient.numerator.mean + np.array([[0.0], [0.0], [0.0], [1e4]]))
+    learned = single_shot_em(Weighted(np.linspace(-3, 3, 50)[:, None], np.zeros(50)), far)
+    assert learned.weight[3] == 0.0
+    np.testing.assert_allclose(learned.cov[3], far.cov[3])
+    assert np.isfinite(learned.mean).all()
+
+
+# Algorithms 4 and 5.
+
+
+def test_igs_and_its_proposal_against_quadrature() -> None:
+    quotient = exact_quotient(FIRST, SECOND, COMMON)
+    wanted = [mixand_moments(quotient, z) for z in range(4)]
+    found = indirect_global_sampling(quotient, laplace_proposal(quotient), np.random.default_rng(0), 40000)
+    total = sum(w[0] for w in wanted)
+    assert found.samples.log_eta == pytest.approx(np.log(total), abs=0.02)
+    for z, (mass, mean, variance) in enumerate(wanted):
+        assert found.mixture.weight[z] == pytest.approx(mass / total, abs=0.01)
+        assert found.mixture.mean[z, 0] == pytest.approx(mean, abs=0.1 * np.sqrt(variance))
+        assert found.mixture.cov[z, 0, 0] == pytest.approx(variance, rel=0.1)
+
+
+def _proposals(kind: str) -> tuple[Proposal, object]:
+    quotient = exact_quotient(FIRST, SECOND, COMMON)
+    if kind == "ingis":
+        return inflated_naive(quotient, FIRST, SECOND), quotient
+    found = laplace(quotient)
+    if kind == "lagis":
+        return laplace_proposals(found), quotient
+    return heavy_tail(found, exact_bound(quotient, COMMON).cov), quotient
+
+
+@pytest.mark.parametrize("kind", ["ingis", "lagis", "heavy_tail"])
+def test_dls_against_quadrature(kind: str) -> None:
+    proposal, quotient = _proposals(kind)
+    found = direct_local_sampling(quotient, proposal, np.random.default_rng(0), 20000)  # type: ignore[arg-type]
+    wanted = [mixand_moments(quotient, z) for z in range(4)]  # type: ignore[arg-type]
+    total = sum(w[0] for w in wanted)
+    assert found.log_eta == pytest.approx(np.log(total), abs=0.02)
+    assert (found.ess > 0.3 * 20000).all()
+    for z, (mass, mean, variance) in enumerate(wanted):
+        assert found.mixture.weight[z] == pytest.approx(mass / total, abs=0.01)
+        assert found.mixture.mean[z, 0] == pytest.approx(mean, abs=0.05 * np.sqrt(variance))
+        assert found.mixture.cov[z, 0, 0] == pytest.approx(variance, rel=0.08)
+
+
+def test_dls_of_a_weighted_exponential_product_against_quadrature() -> None:
+    quotient = wep_quotient(FIRST, SECOND, np.array(0.35))
+    found = direct_local_sampling(quotient, inflated_naive(quotient, FIRST, SECOND), np.random.default_rng(0), 20000)
+    a, b = _log(FIRST), _log(SECOND)
+    assert found.log_eta == pytest.approx(np.log(_integral(0.35 * a + 0.65 * b)), abs=0.02)
+    mean, cov = moments_on_grid(lambda x: 0.35 * log_pdf(FIRST, x) + 0.65 * log_pdf(SECOND, x), POINTS)
+    got = moments(found.mixture)
+    assert got[0][0] == pytest.approx(mean[0], abs=0.05)
+    assert got[1][0, 0] == pytest.approx(cov[0, 0], rel=0.05)
+
+
+def test_the_generator_alone_decides_on_the_samples() -> None:
+    quotient = exact_quotient(FIRST, SECOND, COMMON)
+    proposal = inflated_naive(quotient, FIRST, SECOND)
+    results = [direct_local_sampling(quotient, proposal, np.random.default_rng(s), 50).mixture.mean for s in (1, 1, 2)]
+    np.testing.assert_array_equal(results[0], results[1])
+    assert np.abs(results[0] - results[2]).max() > 1e-3
+
+
+def test_inflated_naive_takes_the_largest_determinant() -> None:
+    first, second = draw(np.random.default_rng(3), count=2), draw(np.random.default_rng(4), count=2)
+    quotient = wep_quotient(first, second, np.array(0.5))
+    for variance in (0.0, 2.0, 1e3):
+        proposal = inflated_naive(quotient, first, second, variance)
+        for z, (v, r) in enumerate(np.ndindex(2, 2)):
+            candidates = [first.cov[v], second.cov[r], variance * np.eye(2)]
+            wanted = max(candidates, key=lambda c: float(np.linalg.det(c)))
+            np.testing.assert_array_equal(proposal.cov[z], wanted)
+
+
+def test_heavy_tails_reach_between_two_and_eight() -> None:
+    found = laplace(exact_quotient(FIRST, SECOND, COMMON))
+    for factor, top in ((1.0, 2.0), (5.0, 5.0), (100.0, 8.0)):
+        scale = heavy_tail(found, factor * found.cov).scale
+        np.testing.assert_allclose(scale[:, 0], 1.0)
+        np.testing.assert_allclose(scale[:, -1], top)
+        np.testing.assert_allclose(scale[:, 1:] / scale[:, :-1], top**0.25)
+
+
+def test_pruning_drops_only_what_is_negligible() -> None:
+    rng = np.random.default_rng(5)
+    first, second, wide = draw(rng, count=5, spread=8.0), draw(rng, count=5, spread=8.0), draw(rng, count=3)
+    common = Mixture(wide.weight, wide.mean, wide.cov + 200 * np.eye(2))
+    quotient = exact_quotient(first, second, common)
+    found, bound = laplace(quotient), exact_bound(quotient, common)
+    kept = prune_mixands(quotient, bound.log_weight, found.log_moment, 14.0)
+    assert 1 <= kept.keep.sum() < 25
+    true = np.exp(found.log_moment - found.log_moment.max())
+    dropped = np.setdiff1d(np.arange(25), kept.order[kept.keep])
+    assert true[dropped].sum() < 25 * np.exp(-14.0)
+    assert true[dropped].sum() / true.sum() <= kept.share < 1e-4
+
+
+def test_floored_covariances() -> None:
+    rng = np.random.default_rng(6)
+    least = draw(rng, 8, count=1).cov[:, 0]
+    cov = least @ np.diag([0.01, 3.0])
+    cov = 0.5 * (cov + np.swapaxes(cov, 1, 2)) + 0.2 * least
+    found = floored(cov, least, 0.3)
+    white = np.linalg.inv(np.linalg.cholesky(least))
+    values = np.linalg.eigvalsh(white @ found @ np.swapaxes(white, 1, 2))
+    assert (values >= 0.3 - 1e-12).all()
+    fine = np.linalg.eigvalsh(white @ cov @ np.swapaxes(white, 1, 2)).min(1) >= 0.3
+    np.testing.assert_array_equal(found[fine], cov[fine])
+
+
+def test_disjoint_densities_show_in_the_normaliser_not_in_the_ess() -> None:
+    far = Mixture(SECOND.weight, SECOND.mean + 200.0, SECOND.cov)
+    found = optimise_omega(FIRST, far, np.random.default_rng(0), 500, omega=np.array(0.5))
+    assert found.samples.ess > 100
+    a = float(found.samples.log_eta)
+    x = np.linspace(60.0, 160.0, 20001)[:, None]
+    logs = 0.5 * (log_pdf(FIRST, x) + log_pdf(far, x))
+    wanted = logs.max() + np.log(integrate.trapezoid(np.exp(logs - logs.max()), x[:, 0]))
+    assert a == pytest.approx(wanted, abs=0.2)
+    assert a < -1000

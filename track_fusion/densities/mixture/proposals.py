@@ -1,0 +1,217 @@
+"""Algorithms 4 and 5 of Ahmed: proposals for quotients of mixtures, sampled as a whole or mixand by mixand.
+
+Batched over leading axes, in the log domain, seeded by the generator they are given; all members of a batch share the
+same random numbers, so that a result does not depend on the batch around it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from track_fusion.densities.log_domain import log_mean_exp, log_sum_exp, normalised
+from track_fusion.densities.mixture.mixture import LOG_2PI, Factored, Mixture, sample
+from track_fusion.densities.mixture.quotient import Laplace, Quotient, laplace
+from track_fusion.densities.mixture.sampling import Weighted, floored, single_shot_em
+from track_fusion.linalg import Array, cholesky, logdet, symmetrise, transpose, whitener
+
+
+def laplace_proposal(quotient: Quotient, inflation: float = 2.0, found: Laplace | None = None) -> Mixture:
+    """Algorithm 4: a mixture to draw samples of a whole quotient from, by Laplace's approximation of its mixands.
+
+    Parameters
+    ----------
+    quotient : Quotient          (..., M) mixands, each integrable
+    inflation : float >= 1       factor on the covariances, for heavier tails
+    found : Laplace or None      the approximation, if known
+
+    Returns
+    -------
+    Mixture    (..., M), weights of sum 1: each mixand's own times its zeroth moment (49), which the paper omits
+    """
+    part = laplace(quotient) if found is None else found
+    return Mixture(normalised(part.log_moment), part.mean, inflation * part.cov)
+
+
+class Global(NamedTuple):
+    """What indirect global sampling gives: the fused mixture (..., M) and the samples behind it."""
+
+    mixture: Mixture
+    samples: Weighted
+
+
+def indirect_global_sampling(
+    quotient: Quotient, proposal: Mixture, rng: np.random.Generator, count: int, floor: float = 0.1
+) -> Global:
+    """IGS for exact fusion: samples of a whole quotient from one proposal, shared out by Algorithm 3.
+
+    Parameters
+    ----------
+    quotient : Quotient      (..., M) mixands
+    proposal : Mixture       (..., C), by :func:`laplace_proposal`
+    rng, count, floor        generator, number of samples in all, smallest covariance as in `single_shot_em`
+    """
+    points = sample(proposal, rng, count).points
+    weight, mean, cov = quotient.numerator
+    joint = Factored.of(Mixture(np.ones(weight.shape), mean, cov), weight).joint(points)
+    below = quotient.log_denominator(points) + Factored.of(proposal).log_pdf(points)
+    samples = Weighted(points, log_sum_exp(joint, -2) - below)
+    return Global(single_shot_em(samples, quotient.numerator, floor, joint), samples)
+
+
+class Proposal(NamedTuple):
+    """One proposal a mixand: N(mean, scale cov) with equal shares of the scales (..., M, H)."""
+
+    mean: Array
+    cov: Array
+    scale: Array
+
+
+def inflated_naive(
+    quotient: Quotient, first: Mixture, second: Mixture, variance: float = 0.0, order: NDArray[np.intp] | None = None
+) -> Proposal:
+    """INGIS (52): the naive mean, with the largest by determinant of both components' covariances and variance * 1.
+
+    `order` (..., P) tells which pairs of components the mixands of the quotient are, if not all in their order.
+    """
+    n = first.mean.shape[-1]
+    det1, det2 = logdet(first.cov)[..., :, None], logdet(second.cov)[..., None, :]
+    cov = np.where((det1 >= det2)[..., None, None], first.cov[..., :, None, :, :], second.cov[..., None, :, :, :])
+    if variance > 0.0:
+        small = np.maximum(det1, det2) < n * np.log(variance)
+        cov = np.where(small[..., None, None], variance * np.eye(n), cov)
+    cov = cov.reshape(*cov.shape[:-4], first.count * second.count, n, n)
+    if order is not None:
+        cov = np.take_along_axis(cov, order[..., None, None], -3)
+    return Proposal(quotient.numerator.mean, cov, np.ones((*cov.shape[:-2], 1)))
+
+
+def laplace_proposals(found: Laplace) -> Proposal:
+    """LAGIS (53): Laplace's approximation of each mixand."""
+    return Proposal(found.mean, found.cov, np.ones((*found.log_moment.shape, 1)))
+
+
+#: Number of scales of the heavy-tailed proposal, and the range in which its largest lies.
+SCALES, LEAST_SPREAD, MOST_SPREAD = 5, 2.0, 8.0
+
+
+def heavy_tail(found: Laplace, wide: Array) -> Proposal:
+    """Heavy tail (54): scales in geometric order from 1 up to the largest that `wide` (..., M, n, n) has of Laplace's.
+
+    `wide` is the covariance of the Gaussian above the mixand, (55); the largest scale is clipped to [2, 8].
+    """
+    white = whitener(found.cov)
+    largest = np.linalg.eigvalsh(symmetrise(white @ wide @ transpose(white)))[..., -1]
+    top = np.clip(largest, LEAST_SPREAD, MOST_SPREAD)
+    return Proposal(found.mean, found.cov, top[..., None] ** np.linspace(0.0, 1.0, SCALES))
+
+
+@dataclasses.dataclass(frozen=True)
+class Local:
+    """What Algorithm 5 gives: the fused mixture (..., M), ESS of each mixand (..., M), log of the integral (...)."""
+
+    mixture: Mixture
+    ess: Array
+    log_eta: Array
+
+
+def direct_local_sampling(
+    quotient: Quotient, proposal: Proposal, rng: np.random.Generator, count: int, floor: float = 0.05
+) -> Local:
+    """Algorithm 5: match each mixand of a quotient by a Gaussian, from samples of its own.
+
+    Parameters
+    ----------
+    quotient : Quotient      (..., M) mixands, each integrable
+    proposal : Proposal      INGIS, LAGIS or heavy tail, one a mixand
+    rng, count               generator and number of samples a mixand
+    floor : float            smallest covariance, as a share of the numerator's
+
+    Returns
+    -------
+    Local    mixture of weight 1; the zeroth moment (35) is that of the un-normalised mixand
+
+    References    N. R. Ahmed, Algorithm 5, eqs. (35)-(37).
+    """
+    log_weight, centre, cov = quotient.numerator
+    (*lead, mixands, n), scales = centre.shape, proposal.scale.shape[-1]
+    normal = _standard_normals(rng, mixands, count, n)
+    # Scales take turns, so that fewer samples still see each of them.
+    stretch = np.sqrt(proposal.scale)[..., np.arange(count) % scales, None]
+    x = proposal.mean[..., None, :] + stretch * (normal @ transpose(cholesky(proposal.cov)))
+    log_m = _log_normals(x, centre, cov, np.ones((*log_weight.shape, 1)))
+    log_m -= quotient.log_denominator(x.reshape(*lead, mixands * count, n)).reshape(log_m.shape)
+    theta = log_m - _log_normals(x, proposal.mean, proposal.cov, proposal.scale)
+    local = Weighted(x, theta)
+    mean, spread = local.moments()
+    weight = log_weight + local.log_eta
+    found = Mixture(normalised(weight), mean, floored(spread, cov, floor))
+    return Local(found, local.ess, log_sum_exp(weight))
+
+
+def _standard_normals(rng: np.random.Generator, sets: int, count: int, n: int) -> Array:
+    """Draw sets (sets, count, n) of standard normal vectors, each shifted and scaled to mean 0 and covariance 1.
+
+    Matching the moments quarters the number of samples that nearly Gaussian mixands need. Sets too small for
+    it stay as they are.
+    """
+    normal = rng.normal(size=(sets, count, n))
+    if count < 4 * n:
+        return normal
+    normal -= normal.mean(1, keepdims=True)
+    return np.asarray(normal @ transpose(whitener(transpose(normal) @ normal / count)))
+
+
+def _log_normals(x: Array, mean: Array, cov: Array, scale: Array) -> Array:
+    """Log-density (..., M, S) of the mean over scales of N(mean, scale cov), one of M for each set of points."""
+    white = whitener(cov)
+    z = (x - mean[..., None, :]) @ transpose(white)
+    half = -0.5 * (z * z).sum(-1)
+    half_logdet = np.log(np.diagonal(white, axis1=-2, axis2=-1)).sum(-1)[..., None]
+    constant = half_logdet - 0.5 * x.shape[-1] * LOG_2PI
+    if scale.shape[-1] == 1:
+        return np.asarray(half / scale + constant - 0.5 * x.shape[-1] * np.log(scale))
+    each = half[..., None, :] / scale[..., None] - 0.5 * x.shape[-1] * np.log(scale)[..., None]
+    return np.asarray(log_mean_exp(each, -2) + constant)
+
+
+# Which mixands to sample.
+
+
+class Pruned(NamedTuple):
+    """The mixands worth sampling, heaviest bound first, and which of them (..., P) are kept.
+
+    `share` (...) bounds how much of the fused density's weight was dropped.
+    """
+
+    quotient: Quotient
+    order: NDArray[np.intp]
+    keep: NDArray[np.bool_]
+    share: Array
+
+
+def prune_mixands(quotient: Quotient, bound: Array, likely: Array, nats: float = 14.0) -> Pruned:
+    """Drop mixands whose upper bound (..., M) lies `nats` below the largest of min(likely, bound).
+
+    Parameters
+    ----------
+    bound : (..., M)     log of an upper bound on each mixand's weight, (56); infinite where there is none
+    likely : (..., M)    log of an estimate of it, by Laplace: the bound alone may be far too high
+
+    Returns
+    -------
+    Pruned    the weights of mixands not kept are minus infinity
+    """
+    top = np.minimum(likely, bound).max(-1, keepdims=True)
+    keep = bound >= top - nats
+    order = np.argsort(np.where(keep, -bound, np.inf), axis=-1, kind="stable")
+    most = int(keep.sum(-1).max(initial=1))
+    order = order[..., :most]
+    kept = np.take_along_axis(keep, order, -1)
+    less = quotient.take(order)
+    numerator = less.numerator._replace(log_weight=np.where(kept, less.numerator.log_weight, -np.inf))
+    lost = log_sum_exp(np.where(keep, -np.inf, bound)) - log_sum_exp(np.where(keep, np.minimum(likely, bound), -np.inf))
+    return Pruned(dataclasses.replace(less, numerator=numerator), order, kept, np.exp(np.minimum(lost, 0.0)))

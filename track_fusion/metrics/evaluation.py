@@ -1,0 +1,146 @@
+"""Tracks against the truth: errors and consistency, per target and over all."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+
+from track_fusion.association.assignment import nearest_pairs
+from track_fusion.linalg import Array
+from track_fusion.metrics.consistency import Consistency, consistency, consistency_of_sum, nees
+from track_fusion.params import Params, param
+from track_fusion.solvers.chi_square import chi_square_quantile
+from track_fusion.tracks import StateLayout, TrackBatch
+
+#: Fewer samples than this prove nothing.
+MIN_SAMPLES = 10
+#: How often a consistent estimator may be called overconfident: seldom, since one looks again and again while samples
+#: come, and samples of one run are correlated.
+FALSE_ALARM = 1e-5
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationParams(Params):
+    """How tracks are matched with the truth."""
+
+    max_distance_m: float = param(
+        1000.0,
+        "a track farther from every target than this is false, a target without a nearer track missed",
+        unit="m",
+        low=0.0,
+        strict=True,
+    )
+    confirmed_only: bool = param(True, "judge confirmed tracks only")
+
+
+class Evaluation:
+    """Collects truth and tracks by stamp, in any order, and judges each time at which both are there.
+
+    Targets and tracks are matched one to one by least total distance between positions.
+    """
+
+    def __init__(self, layout: StateLayout, params: EvaluationParams) -> None:
+        self._layout, self._params = layout, params
+        self._truth: dict[int, list[TrackBatch]] = defaultdict(list)
+        self._tracks: dict[int, TrackBatch] = {}
+        self._judged: dict[int, list[tuple[int, int, Array, float]]] = {}  # time -> (target, track, error, nees)
+        self._nees_sum, self._samples_judged = 0.0, 0
+
+    @property
+    def times(self) -> int:
+        """Number of times judged."""
+        return len(self._judged)
+
+    def add_truth(self, truth: TrackBatch) -> None:
+        """Take the true state of a target; a repeated one replaces the one before."""
+        if len(truth):
+            stamp_ns, again = int(truth.time_ns[0]), set(truth.track_id.tolist())
+            others = [b for b in self._truth[stamp_ns] if again.isdisjoint(b.track_id.tolist())]
+            self._truth[stamp_ns] = [*others, truth]
+            self._judge(stamp_ns)
+
+    def add_tracks(self, stamp_ns: int, tracks: TrackBatch) -> None:
+        """Take the tracks of a time, also when there are none."""
+        self._tracks[stamp_ns] = tracks[tracks.is_confirmed] if self._params.confirmed_only else tracks
+        self._judge(stamp_ns)
+
+    def _judge(self, stamp_ns: int) -> None:
+        """Judge one time as soon as truth and tracks are there; more truth of the same time judges it again."""
+        if stamp_ns not in self._tracks or stamp_ns not in self._truth:
+            return
+        truth, tracks = TrackBatch.concatenate(self._truth[stamp_ns]), self._tracks[stamp_ns]
+        true_state = truth.moments[0]
+        mean, cov = tracks.moments
+        at = list(self._layout.position)
+        target, track = nearest_pairs(true_state[:, at], mean[:, at], self._params.max_distance_m)
+        error = mean[track] - true_state[target]
+        turned = self._layout.angular
+        error[:, turned] = np.remainder(error[:, turned] + np.pi, 2 * np.pi) - np.pi
+        values = nees(error, cov[track])
+        before = self._judged.get(stamp_ns, [])
+        self._judged[stamp_ns] = [
+            (int(truth.track_id[i]), int(tracks.track_id[j]), e, float(v))
+            for i, j, e, v in zip(target, track, error, values, strict=True)
+        ]
+        self._nees_sum += float(values.sum()) - sum(sample[-1] for sample in before)
+        self._samples_judged += len(values) - len(before)
+
+    def _samples(self) -> list[tuple[int, int, int, Array, float]]:
+        return [(t, *sample) for t, samples in sorted(self._judged.items()) for sample in samples]
+
+    def consistency(self) -> Consistency:
+        """ANEES over all targets and times; kept up to date, since a node asks at every message."""
+        return consistency_of_sum(self._nees_sum, self._samples_judged, self._layout.size)
+
+    def is_overconfident(self) -> bool:
+        """Tell whether errors are larger than the covariances say, on enough samples and beyond doubt."""
+        found = self.consistency()
+        terms = found.samples * found.axes
+        return found.samples >= MIN_SAMPLES and found.anees > chi_square_quantile(1.0 - FALSE_ALARM, terms) / terms
+
+    def result(self) -> dict[str, Any]:
+        """Everything as JSON-ready values: figures over all and for each target, unmatched tracks and targets."""
+        samples = self._samples()
+        targets = sorted({s[1] for s in samples})
+        matched = len(samples)
+        truths = sum(len(b) for t in self._judged for b in self._truth[t])
+        published = sum(len(self._tracks[t]) for t in self._judged)
+        return {
+            "times": self.times,
+            "unmatched_times": len(set(self._truth) ^ set(self._tracks)),
+            "missed": truths - matched,
+            "false": published - matched,
+            "all": self._figures(samples),
+            "targets": {
+                str(t): self._figures([s for s in samples if s[1] == t])
+                | {"track_ids": sorted({s[2] for s in samples if s[1] == t})}
+                for t in targets
+            },
+        }
+
+    def _figures(self, samples: list[tuple[int, int, int, Array, float]]) -> dict[str, Any]:
+        """RMSE, mean error norm (the one-run ARMSE) and consistency of some samples."""
+        errors = np.array([s[3] for s in samples]).reshape(-1, self._layout.size)
+        found = consistency(np.array([s[4] for s in samples]), self._layout.size)
+        figures: dict[str, Any] = {"samples": len(samples)}
+        rate = tuple(i for i, name in enumerate(self._layout.axes) if name == "turn_rate")
+        quantities = [("position", self._layout.position, "m", 1.0), ("velocity", self._layout.velocity, "mps", 1.0)]
+        quantities += [("turn_rate", rate, "degps", float(np.degrees(1.0)))] if rate else []
+        for name, at, unit, factor in quantities:
+            norm = factor * np.linalg.norm(errors[:, list(at)], axis=1)
+            figures[f"{name}_rmse_{unit}"] = _number(np.sqrt((norm**2).mean()) if len(norm) else math.nan)
+            figures[f"{name}_armse_{unit}"] = _number(norm.mean() if len(norm) else math.nan)
+        figures |= {
+            "anees": _number(found.anees), "anees_low": _number(found.low), "anees_high": _number(found.high),
+            "verdict": found.verdict,
+        }  # fmt: skip
+        return figures
+
+
+def _number(value: float) -> float | None:
+    """JSON knows no NaN."""
+    return None if math.isnan(value) else float(value)

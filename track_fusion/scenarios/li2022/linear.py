@@ -1,0 +1,191 @@
+"""Li et al., AA density fusion, section IV-A: one target, two position sensors, linear and Gaussian."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from track_fusion.filters.kalman import predict, update, update_joint
+from track_fusion.linalg import Array
+from track_fusion.models.measurement import LinearSensor
+from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
+from track_fusion.rules import RULES, FusedTracks
+from track_fusion.scenarios.li2022.claims import (
+    ASSUMPTIONS,
+    AVERAGE,
+    CREDIBILITY,
+    INTERSECTION,
+    POSITION,
+    VELOCITY,
+    balance_claims,
+    below_each,
+    close,
+    named,
+    union_claims,
+    weight_claims,
+)
+from track_fusion.scenarios.li2022.claims import (
+    RULES as ROWS,
+)
+from track_fusion.study.one_target import RULE_CHOICES, Row, Sir, fusion_streams, sir_rows
+from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
+from track_fusion.study.scenario import Claim, Printed, RuleChoice, Scenario, Tracking, fuse_runs
+from track_fusion.tracks import planar_layout
+
+#: Table I: ARMSE of position (m) and velocity (m/s).
+TABLE_1 = {
+    "kf-alone": (19.95, 10.86),
+    "kf-ic": (18.13, 10.51),
+    "kf-naive": (39.99, 13.32),
+    "kf-arithmetic_average": (18.57, 10.91),
+    "kf-covariance_intersection": (18.85, Printed("10.70")),
+    "kf-covariance_union": (24.36, 12.06),
+    "sir-alone": (22.90, 11.74),
+    "sir-ic": (20.62, 11.36),
+    "sir-naive": (66.07, 16.16),
+    "sir-arithmetic_average": (19.55, Printed("11.30")),
+    "sir-covariance_intersection": (20.76, 11.23),
+    "sir-covariance_union": (25.42, 12.72),
+}
+#: The weight that Fig. 6 shows, as the text reads it off.
+SECTION_4A = {"kf-arithmetic_average/sensor_1_weight_1": 0.575}
+LAYOUT = planar_layout()
+QUANTITIES = (Quantity("position", "m", LAYOUT.position), Quantity("velocity", "mps", LAYOUT.velocity))
+SIR = Sir(200)
+
+MOTION = NearlyConstantVelocity(LAYOUT, MotionParams(noise_form="piecewise_constant", process_noise=5.0))
+SENSORS = {"sensor_1": LinearSensor.position(LAYOUT, 20.0), "sensor_2": LinearSensor.position(LAYOUT, 40.0)}
+TRACKING = Tracking(
+    motion=MOTION,
+    dt_s=1.0,
+    steps=100,
+    initial_mean=np.array([1000.0, 1000.0, 20.0, 0.0]),
+    initial_cov=np.diag([500.0, 500.0, 50.0, 50.0]),
+    sensors=SENSORS,
+)
+
+
+def _start(runs: int) -> tuple[Array, Array]:
+    """State of all runs, (R, n), and its covariance, (1, n, n), which they share as long as it depends on no data."""
+    return np.tile(TRACKING.initial_mean, (runs, 1)), TRACKING.initial_cov[None]
+
+
+def one_filter(seen: Sequence[Array]) -> Iterator[FusedTracks]:
+    """One filter that uses the measurements of the given sensors, (R, T, m) each, jointly."""
+    sensors = list(SENSORS.values())[: len(seen)]
+    mean, cov = _start(len(seen[0]))
+    for k in range(TRACKING.steps):
+        mean, cov = predict(mean, cov, *MOTION.matrices(TRACKING.dt_s))
+        z = [s[:, k] for s in seen]
+        mean, cov, _ = update_joint(mean, cov, z, [s.matrix for s in sensors], [s.noise for s in sensors])
+        yield FusedTracks(mean, cov)
+
+
+def fused_filters(
+    choice: RuleChoice, seen: Sequence[Array], rngs: Sequence[np.random.Generator] | None = None
+) -> Iterator[FusedTracks]:
+    """One filter a sensor, fused after each step, the fused posterior fed back to all of them.
+
+    `rngs`: a generator a run, for a rule that samples.
+    """
+    rule, sensors = RULES[choice.key], list(SENSORS.values())
+    mean, cov = _start(len(seen[0]))
+    for k in range(TRACKING.steps):
+        mean, cov = predict(mean, cov, *MOTION.matrices(TRACKING.dt_s))
+        local = [update(mean, cov, z[:, k], s.matrix, s.noise)[:2] for z, s in zip(seen, sensors, strict=True)]
+        means, covs = (np.stack(parts, 1) for parts in zip(*local, strict=True))
+        fused = fuse_runs(rule, choice.params, means, covs, rngs)
+        mean, cov = fused.mean, fused.cov
+        yield fused
+
+
+def kalman_row(choice: RuleChoice) -> Row:
+    """Two Kalman filters fused by any rule."""
+    return Row(lambda sample: fused_filters(choice, sample.seen, fusion_streams(sample)))
+
+
+def kalman_rows() -> dict[str, Row]:
+    """Rows of Table I by Kalman filters."""
+    table = {"kf-alone": Row(lambda s: one_filter(s.seen[:1])), "kf-ic": Row(lambda s: one_filter(s.seen))}
+    return table | {f"kf-{choice.name}": kalman_row(choice) for choice in RULE_CHOICES}
+
+
+def particle_rows() -> dict[str, Row]:
+    """Rows of Table I by particle filters."""
+    return sir_rows(TRACKING, SIR, RULE_CHOICES)
+
+
+STUDY = OneTargetStudy(TRACKING, QUANTITIES, kalman_rows() | particle_rows(), ("kf", kalman_row))
+
+
+#: Two rows are close to each other if all of Table I that the text calls so are: SIR-CI is 6 % above SIR-AA.
+CLOSE = 0.06
+_OTHERS = ("alone", "ic", AVERAGE, INTERSECTION, "covariance_union")
+
+
+def _claims() -> tuple[Claim, ...]:
+    found = [
+        Claim.least(
+            "KF with both sensors' measurements (IC) is the best row of all",
+            "IV-A",
+            f"kf-ic/{POSITION}",
+            [n for one in ("kf", "sir") for n in named(POSITION, one, *ROWS) if n != f"kf-ic/{POSITION}"],
+        ),
+        below_each(
+            "the Kalman filter does better than the particle filter with every rule and alone",
+            "IV-A",
+            named(POSITION, "kf", *ROWS),
+            named(POSITION, "sir", *ROWS),
+        ),
+        Claim(
+            "KF-IC is Bayes-optimal: what it claims is its mean squared error (credibility within 5 % of 1)",
+            "IV",
+            named(CREDIBILITY, "kf", "ic"),
+            lambda e: abs(e.value - 1.0) < 0.05,
+        ),
+    ]
+    for one in ("kf", "sir"):
+        name = one.upper()
+        ic, average, intersection = named(POSITION, one, "ic", AVERAGE, INTERSECTION)
+        found += [
+            Claim.greatest(
+                f"{name} with naive fusion is the worst row, worse than sensor 1 alone",
+                "IV-A",
+                f"{one}-naive/{POSITION}",
+                named(POSITION, one, *_OTHERS),
+            ),
+            close(f"{name}: average and intersection are similar (within 6 %)", "IV-A", CLOSE, average, intersection),
+            close(f"{name}: the average is close to IC (within 6 %)", "IV-A", CLOSE, ic, average),
+            close(f"{name}: the intersection is close to IC (within 6 %)", "IV-A", CLOSE, ic, intersection),
+            Claim.order(f"{name}: the average beats the intersection in position", "Table I", average, intersection),
+            Claim.order(
+                f"{name}: the intersection beats the average in velocity",
+                "Table I",
+                *named(VELOCITY, one, INTERSECTION, AVERAGE),
+            ),
+            *union_claims(one, "IV-A"),
+            *balance_claims(one, "IV-A"),
+        ]
+    return (*found, *weight_claims("kf", "IV-A, Fig. 6"))
+
+
+SCENARIO = Scenario(
+    key="li2022-linear",
+    title="Two position sensors, one target, linear and Gaussian",
+    paper="Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average Density Fusion, IV-A",
+    shows="what fusing with unknown correlation costs and gains when the fused posterior is fed back to both filters",
+    published=published(TABLE_1, QUANTITIES) | SECTION_4A,
+    published_runs=100,
+    default_runs=150,
+    publication_runs=1000,
+    assumptions=ASSUMPTIONS,
+    sample=STUDY.sample,
+    figures=STUDY.figures,
+    charts=STUDY.charts,
+    claims=_claims(),
+    piece=50,
+    tracking=TRACKING,
+    rules=RULE_CHOICES,
+    compare=STUDY.compare,
+)

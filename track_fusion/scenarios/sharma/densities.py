@@ -1,0 +1,157 @@
+"""What the examples of Sharma et al., section 5.2, share: two given densities of the plane, fused once."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+
+from track_fusion.densities.mean_density import Kind, log_mean_density
+from track_fusion.densities.mixture.divergence import grid, kl_on_grid, moments_on_grid
+from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments
+from track_fusion.linalg import Array
+from track_fusion.metrics.accuracy import Estimate
+from track_fusion.random_streams import stream
+from track_fusion.rules import RULES, FusedTracks, SourceTracks
+from track_fusion.rules.geometric_mean_sampling import GeometricMeanSamplingParams
+from track_fusion.rules.harmonic_mean import HarmonicMeanParams
+from track_fusion.study.scenario import Progress, RuleChoice, Samples, check_needs, chosen
+
+#: Weight of both densities in every fusion whose weights are not sought.
+HALF = (0.5, 0.5)
+#: Samples of one fusion by sampling, as in the paper.
+SAMPLES = 5000
+#: Covariances of (75)-(76), and of every mixture's two components.
+COVS = np.array([[[2.5, -1.0], [-1.0, 1.2]], [[0.8, -0.5], [-0.5, 4.0]]])
+#: Where densities are summed up: spacing a ninth of the smallest standard deviation, hardly anything outside.
+POINTS = grid(np.full(2, -14.0), np.full(2, 14.0), 280)
+
+HMD_GA = RuleChoice("harmonic_mean", HarmonicMeanParams(criterion="given", weights=HALF))
+HMD_S = RuleChoice(
+    "harmonic_mean",
+    HarmonicMeanParams(criterion="given", weights=HALF, method="sampling", samples=SAMPLES),
+    "sampled",
+)
+GMD_S = RuleChoice(
+    "geometric_mean_sampling", GeometricMeanSamplingParams(criterion="given", weights=HALF, samples=SAMPLES)
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Pair:
+    """Two densities to be fused: parts, weight (2, C), mean (2, C, 2), cov (2, C, 2, 2)."""
+
+    parts: Mixture
+
+    @property
+    def tracks(self) -> SourceTracks:
+        """The densities as a rule takes them; those of one component as Gaussians."""
+        mean, cov = moments(self.parts)
+        return SourceTracks(mean, cov, mixture=self.parts if self.parts.count > 1 else None)
+
+    def log_mean(self, points: Array, kind: Kind, weights: Sequence[float] = HALF) -> Array:
+        """Logarithm (S,) of the harmonic or geometric mean density, not normalised, at points (S, 2)."""
+        return log_mean_density(log_pdf(self.parts, points[None]), np.asarray(weights, float), kind)
+
+    def by_rule(self, choice: RuleChoice) -> Row:
+        """Fuse by a rule."""
+        rule, tracks = RULES[choice.key], self.tracks
+        return Row(
+            self,
+            lambda rng: rule.fuse(dataclasses.replace(tracks, extras={"seed": rng}), choice.params),
+            rule.uses("seed", choice.params),
+        )
+
+    def by_grid(self, kind: Kind, inflation: float = 1.0) -> Row:
+        """Take the moments of a mean density by summation; `inflation`: those that samples of wider densities have."""
+
+        def density(points: Array) -> Array:
+            wide = dataclasses.replace(self.parts, cov=inflation * self.parts.cov)
+            drawn, meant = (np.logaddexp(*log_pdf(parts, points[None])) for parts in (wide, self.parts))
+            return np.asarray(self.log_mean(points, kind) + drawn - meant)
+
+        return Row(self, lambda rng: FusedTracks(*moments_on_grid(density, POINTS)))
+
+    @cached_property
+    def exact(self) -> Array:
+        """Logarithm of the harmonic mean density, not normalised, at POINTS."""
+        return self.log_mean(POINTS, "harmonic")
+
+    def divergence(self, fused: FusedTracks) -> float:
+        """Kullback-Leibler divergence of the exact harmonic mean density from what was fused, in nats."""
+        mixture = fused.mixture or Mixture(np.ones(1), fused.mean[None], fused.cov[None])
+        return kl_on_grid(lambda points: self.exact, lambda points: log_pdf(mixture, points), POINTS)
+
+    def compare(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+        """Fuse by any rules: divergence of the exact harmonic mean density from each result, (R,).
+
+        Raises
+        ------
+        ParameterError    a rule needs more than the two densities
+        """
+        check_needs(rules)
+        samples = sample({f"given-{c.name}": self.by_rule(c) for c in rules}, runs, seed, progress)
+        return {name: values for name, values in samples.items() if name.endswith("/kld_nats")}
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One fusion of a pair: a function of a generator, and whether it draws from it."""
+
+    pair: Pair
+    fuse: Callable[[np.random.Generator], FusedTracks]
+    random: bool = False
+
+
+def sample(rows: Mapping[str, Row], runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+    """Fuse by each row whose name starts with `only`; a row that draws nothing, once for all runs.
+
+    Returns
+    -------
+    {row/mean: (R, 2), row/cov: (R, 2, 2), row/kld_nats: (R,)}, and for a mixture of M components row/weight
+    (R, M), row/means (R, M, 2), row/covs (R, M, 2, 2)
+    """
+    found: Samples = {}
+    rows = chosen(rows, only)
+    for done, (name, row) in enumerate(rows.items()):
+        which = runs if row.random else runs[:1]
+        fused = [row.fuse(stream(seed, run, "samples")) for run in which]
+        for column, values in _columns(row.pair, fused).items():
+            found[f"{name}/{column}"] = values if row.random else np.repeat(values, len(runs), 0)
+        progress((done + 1) / len(rows))
+    return found
+
+
+def _columns(pair: Pair, fused: Sequence[FusedTracks]) -> Samples:
+    """Put the results of several runs together."""
+    columns = {
+        "mean": np.stack([f.mean for f in fused]),
+        "cov": np.stack([f.cov for f in fused]),
+        "kld_nats": np.array([pair.divergence(f) for f in fused]),
+    }
+    mixtures = [f.mixture for f in fused if f.mixture is not None]
+    if mixtures:
+        columns["weight"], columns["means"], columns["covs"] = (
+            np.stack([getattr(m, field) for m in mixtures]) for field in ("weight", "mean", "cov")
+        )
+    return columns
+
+
+def figures(rows: Mapping[str, Row], samples: Samples) -> dict[str, Estimate]:
+    """Mean, determinant of the covariance and divergence of every row sampled."""
+    found = {}
+    for name, row in rows.items():
+        if f"{name}/mean" not in samples:
+            continue
+        mean, cov = samples[f"{name}/mean"], samples[f"{name}/cov"]
+        columns = {
+            "determinant_1": np.linalg.det(cov),
+            "mean_x_1": mean[:, 0],
+            "mean_y_1": mean[:, 1],
+            "kld_nats": samples[f"{name}/kld_nats"],
+        }
+        for column, values in columns.items():
+            found[f"{name}/{column}"] = Estimate.mean(values) if row.random else Estimate.exact(values[0])
+    return found

@@ -1,0 +1,215 @@
+"""Sharma et al., section 5.2, Fig. 1: two Gaussian densities fused by every rule of the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+from scipy.optimize import brentq
+
+from track_fusion.densities.mixture.mixture import Mixture
+from track_fusion.metrics.accuracy import Estimate
+from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
+from track_fusion.rules.ellipsoidal_intersection import EllipsoidalIntersectionParams
+from track_fusion.rules.harmonic_mean import HarmonicMeanParams
+from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
+from track_fusion.rules.naive import NaiveParams
+from track_fusion.scenarios.sharma import densities as shared
+from track_fusion.scenarios.sharma.densities import COVS, GMD_S, HALF, HMD_GA, HMD_S, SAMPLES, Pair, Row
+from track_fusion.study.chart import Chart, Series, ellipse
+from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario
+
+#: (75)-(76).
+MEANS = np.array([[0.5, 1.0], [2.0, 1.0]])
+PAIR = Pair(Mixture(np.ones((2, 1)), MEANS[:, None], COVS[:, None]))
+#: The same with both means in one place.
+SAME_MEAN = Pair(Mixture(np.ones((2, 1)), np.zeros((2, 1, 2)), COVS[:, None]))
+#: Inflation of the covariances that HMD-S draws from, besides none.
+ALPHAS = (1.1, 1.2, 1.5)
+#: What counts as a small variation of alpha.
+SMALL_ALPHA = 1.5
+
+CI = RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="given", weights=HALF))
+ICI = RuleChoice(
+    "inverse_covariance_intersection", InverseCovarianceIntersectionParams(criterion="given", weights=HALF)
+)
+#: Each at the weights that its own criterion finds, by the determinant.
+OWN_WEIGHTS = (
+    RuleChoice("covariance_intersection", CovarianceIntersectionParams(), "own_weights"),
+    RuleChoice("inverse_covariance_intersection", InverseCovarianceIntersectionParams(), "own_weights"),
+    RuleChoice("harmonic_mean", HarmonicMeanParams(), "own_weights"),
+)
+RULE_CHOICES = (
+    RuleChoice("naive", NaiveParams()), CI, GMD_S, ICI,
+    RuleChoice("ellipsoidal_intersection", EllipsoidalIntersectionParams()), HMD_GA, HMD_S, *OWN_WEIGHTS,
+)  # fmt: skip
+
+
+def _label(alpha: float) -> str:
+    return f"alpha_{alpha:g}".replace(".", "_")
+
+
+def _inflated(alpha: float) -> RuleChoice:
+    params = HarmonicMeanParams(criterion="given", weights=HALF, method="sampling", samples=SAMPLES, inflation=alpha)
+    return RuleChoice("harmonic_mean", params, f"sampled_{_label(alpha)}")
+
+
+def _rows() -> dict[str, Row]:
+    table = {f"given-{choice.name}": PAIR.by_rule(choice) for choice in RULE_CHOICES}
+    for choice in OWN_WEIGHTS[1:]:
+        table[f"given-{choice.name}_same_mean"] = SAME_MEAN.by_rule(choice)
+    table["given-harmonic_mean@grid"] = PAIR.by_grid("harmonic")
+    for alpha in ALPHAS:
+        table[f"given-{_inflated(alpha).name}"] = PAIR.by_rule(_inflated(alpha))
+        table[f"given-harmonic_mean@grid_{_label(alpha)}"] = PAIR.by_grid("harmonic", alpha)
+    return table
+
+
+ROWS = _rows()
+LEAST_ALPHA = "given-harmonic_mean@grid/least_alpha_1"
+
+
+def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+    """Fuse (75)-(76) by the rows whose names start with `only`; see sharma_densities."""
+    return shared.sample(ROWS, runs, seed, progress, only)
+
+
+def figures(samples: Samples) -> dict[str, Estimate]:
+    """Moments, determinant and divergence of each row; the least alpha that exceeds the geometric mean."""
+    found = shared.figures(ROWS, samples)
+    if "given-harmonic_mean@grid/mean" in samples:
+        found[LEAST_ALPHA] = Estimate.exact(least_alpha())
+    return found
+
+
+def determinant(alpha: float) -> float:
+    """Determinant of HMD-S at this inflation, in the limit of many samples."""
+    return float(np.linalg.det(PAIR.by_grid("harmonic", alpha).fuse(np.random.default_rng()).cov))
+
+
+@cache
+def least_alpha() -> float:
+    """Inflation at which the harmonic mean's determinant is that of the geometric mean."""
+    wanted = float(np.linalg.det(PAIR.by_rule(CI).fuse(np.random.default_rng()).cov))
+    return float(brentq(lambda alpha: determinant(alpha) - wanted, 1.0, 2.0, xtol=1e-6))
+
+
+def charts(samples: Samples) -> list[Chart]:
+    """Fig. 1a and 1b, and the determinants behind them."""
+    measured = figures(samples)
+    sources = tuple(ellipse(f"p{i + 1}", MEANS[i], COVS[i], style="dashed") for i in range(2))
+    fused = {
+        "GMD = CI": "given-covariance_intersection", "GMD-S": "given-geometric_mean_sampling",
+        "HMD": "given-harmonic_mean@grid", "HMD-S": "given-harmonic_mean@sampled", "HMD-GA": "given-harmonic_mean",
+        "ICI": "given-inverse_covariance_intersection",
+    }  # fmt: skip
+    inflated = {"GMD = CI": fused["GMD = CI"], "HMD-S, alpha 1": fused["HMD-S"]}
+    inflated |= {f"HMD-S, alpha {a:g}": f"given-{_inflated(a).name}" for a in ALPHAS}
+    found = [
+        Chart(f"86.5 % regions: {title}", "x", "y", (*sources, *_ellipses(samples, rows)), equal=True)
+        for title, rows in (("the fusions (sampling: one run)", fused), ("inflation (one run)", inflated))
+        if any(f"{row}/mean" in samples for row in rows.values())
+    ]
+    found.append(_bars(measured))
+    if LEAST_ALPHA in measured:
+        found.append(_inflation_chart(measured))
+    return found
+
+
+def _bars(measured: dict[str, Estimate]) -> Chart:
+    """Determinants at equal weights, without inflation."""
+    bars = {
+        name.partition("/")[0].removeprefix("given-"): estimate
+        for name, estimate in measured.items()
+        if name.endswith("/determinant_1") and "alpha" not in name and "own_weights" not in name
+    }
+    place = np.arange(len(bars), dtype=float)
+    values = np.array([e.value for e in bars.values()])
+    errors = np.nan_to_num([e.standard_error for e in bars.values()])
+    series = Series("", place, values, "bars", errors)
+    return Chart(
+        "Determinants at weights 1/2", "", "determinant", (series,), ticks=dict(zip(place.tolist(), bars, strict=True))
+    )
+
+
+def _ellipses(samples: Samples, rows: dict[str, str]) -> list[Series]:
+    return [
+        ellipse(
+            label,
+            samples[f"{row}/mean"][0],
+            samples[f"{row}/cov"][0],
+            style="dotted" if label in ("GMD-S", "HMD-S") else "line",
+        )
+        for label, row in rows.items()
+        if f"{row}/mean" in samples
+    ]
+
+
+def _inflation_chart(measured: dict[str, Estimate]) -> Chart:
+    """Determinant of the harmonic mean over alpha: exact, and sampled where it was."""
+    alpha = np.linspace(1.0, 1.6, 13)
+    lines = [Series("HMD, many samples", alpha, np.array([determinant(a) for a in alpha]))]
+    level = np.full(2, np.linalg.det(PAIR.by_rule(CI).fuse(np.random.default_rng()).cov))
+    lines.append(Series("GMD = CI, not inflated", alpha[[0, -1]], level, "dashed"))
+    names = {1.0: "given-harmonic_mean@sampled"} | {a: f"given-{_inflated(a).name}" for a in ALPHAS}
+    drawn = {a: measured[f"{n}/determinant_1"] for a, n in names.items() if f"{n}/determinant_1" in measured}
+    if drawn:
+        errors = np.nan_to_num([e.standard_error for e in drawn.values()])
+        values = np.array([e.value for e in drawn.values()])
+        lines.append(Series("HMD-S", np.array(list(drawn)), values, "points", errors))
+    return Chart("Inflation of what is sampled", "alpha", "determinant", tuple(lines))
+
+
+def _order(text: str, source: str, *rows: str) -> Claim:
+    return Claim.order(text, source, *(f"given-{row}/determinant_1" for row in rows))
+
+
+SCENARIO = Scenario(
+    key="sharma-gaussians",
+    title="Two Gaussian densities, fused by every rule of the paper",
+    paper="Sharma et al., Harmonic Mean Density Fusion in Distributed Tracking, 5.2, Fig. 1",
+    shows="how much each rule claims about the same pair, sampled beside exact, and what inflating the samples does",
+    published={},
+    published_runs=1,
+    default_runs=200,
+    publication_runs=1000,
+    assumptions=(
+        "assumed: weights 1/2 in every fusion, except @own_weights: the determinant criterion's",
+        "assumed: alpha 1.1, 1.2 and 1.5, a small variation up to 1.5; the paper's are in the figure alone",
+        "a run is one fusion by 5000 samples, drawn from the balanced mixture of both densities: choosing sample by "
+        "sample, as in (74), biases; @grid: the density itself by summation, with alpha: the limit of many samples",
+        "GMD of Gaussians is covariance intersection at the same weights",
+        "@own_weights_same_mean: assumed, both means in one place, to show what the weights do",
+        "divergence: of the exact harmonic mean density from the Gaussian with the fused moments",
+        "the relative times of Table 1 are no figures, since times do not repeat: python -m benchmark --only rules",
+    ),
+    sample=sample,
+    figures=figures,
+    charts=charts,
+    claims=(
+        _order(
+            "The covariance shrinks from GMD-S to HMD-S to HMD-GA.", "5.2, Fig. 1a",
+            "harmonic_mean", "harmonic_mean@sampled", "geometric_mean_sampling",
+        ),
+        Claim.least(
+            "HMD-GA claims less than ICI, HMD-S and CI at the same weights.", "6, Fig. 1a, A",
+            f"given-{HMD_GA.name}/determinant_1", [f"given-{c.name}/determinant_1" for c in (ICI, HMD_S, CI)],
+        ),
+        _order(
+            "HMD-GA is tighter than ICI when each finds its own weights: (75)-(76).", "7",
+            "harmonic_mean@own_weights", "inverse_covariance_intersection@own_weights",
+        ),
+        _order(
+            "HMD-GA is always tighter than ICI: the same covariances, means in one place, own weights.", "7",
+            "harmonic_mean@own_weights_same_mean", "inverse_covariance_intersection@own_weights_same_mean",
+        ),
+        _order(
+            f"Inflation by {SMALL_ALPHA:g} makes HMD-S wider than GMD.", "5.2, Fig. 1b",
+            "harmonic_mean@sampled", "covariance_intersection", f"harmonic_mean@sampled_{_label(SMALL_ALPHA)}",
+        ),
+    ),
+    piece=50,
+    rules=RULE_CHOICES,
+    compare=PAIR.compare,
+)  # fmt: skip

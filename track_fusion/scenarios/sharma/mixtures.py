@@ -1,0 +1,113 @@
+"""Sharma et al., section 5.2, Fig. 2: two Gaussian mixtures fused by sampling."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from track_fusion.densities.mean_density import Kind
+from track_fusion.densities.mixture.mixture import Mixture, log_pdf
+from track_fusion.linalg import Array
+from track_fusion.metrics.accuracy import Estimate
+from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
+from track_fusion.rules.mixture_geometric import MixtureGeometricParams
+from track_fusion.scenarios.sharma import densities as shared
+from track_fusion.scenarios.sharma.densities import COVS, GMD_S, HALF, HMD_GA, HMD_S, Pair
+from track_fusion.study.chart import Chart, Contours
+from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario
+
+#: The two mixtures after (76); the second is printed as another p^1.
+PAIR = Pair(
+    Mixture(
+        np.array([[0.3, 0.7], [0.4, 0.6]]),
+        np.array([[[-0.5, 3.0], [2.0, 0.3]], [[-1.5, 1.0], [3.0, -4.0]]]),
+        np.stack([COVS, COVS]),
+    )
+)
+RULE_CHOICES = (
+    GMD_S,
+    HMD_S,
+    RuleChoice("mixture_geometric", MixtureGeometricParams(criterion="given", weights=HALF)),
+    RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="given", weights=HALF)),
+    HMD_GA,
+)
+ROWS = {f"given-{choice.name}": PAIR.by_rule(choice) for choice in RULE_CHOICES} | {
+    "given-geometric_mean_sampling@grid": PAIR.by_grid("geometric"),
+    "given-harmonic_mean@grid": PAIR.by_grid("harmonic"),
+}
+#: Where contours are drawn, and at which shares of the highest density.
+X, Y = np.linspace(-6.0, 6.0, 61), np.linspace(-10.0, 7.0, 86)
+LEVELS = (0.05, 0.2, 0.5, 0.8)
+
+
+def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+    """Fuse the mixtures by the rows whose names start with `only`; see sharma_densities."""
+    return shared.sample(ROWS, runs, seed, progress, only)
+
+
+def figures(samples: Samples) -> dict[str, Estimate]:
+    """Moments, determinant and divergence of each row."""
+    return shared.figures(ROWS, samples)
+
+
+def charts(samples: Samples) -> list[Chart]:
+    """Fig. 2: the sources, and each mean density exact and by one fusion of samples."""
+    plane = np.stack(np.meshgrid(X, Y), -1).reshape(-1, 2)
+    sources = tuple(_contours(f"p{i + 1}", log_pdf(PAIR.parts.at(i), plane)) for i in range(2))
+    found = [Chart("Sources", "x", "y", contours=sources, equal=True)]
+    kinds: dict[str, tuple[Kind, RuleChoice]] = {"GMD": ("geometric", GMD_S), "HMD": ("harmonic", HMD_S)}
+    for title, (kind, choice) in kinds.items():
+        row = f"given-{choice.name}"
+        if f"{row}/weight" in samples:
+            drawn = Mixture(*(samples[f"{row}/{column}"][0] for column in ("weight", "means", "covs")))
+            lines = _contours(title, PAIR.log_mean(plane, kind)), _contours(f"{title}-S", log_pdf(drawn, plane))
+            found.append(Chart(f"{title}, exact and by samples (one run)", "x", "y", contours=lines, equal=True))
+    return found
+
+
+def _contours(label: str, log_density: Array) -> Contours:
+    """Contours at shares of the highest value on the plane, from logarithms (S,)."""
+    z = np.exp(log_density - log_density.max()).reshape(len(Y), len(X))
+    return Contours(label, X, Y, z.round(4), LEVELS)
+
+
+SCENARIO = Scenario(
+    key="sharma-mixtures",
+    title="Two Gaussian mixtures, fused by sampling",
+    paper="Sharma et al., Harmonic Mean Density Fusion in Distributed Tracking, 5.2, Fig. 2",
+    shows="the geometric and the harmonic mean of mixtures, sampled beside exact, and what Gaussian stand-ins lose",
+    published={},
+    published_runs=1,
+    default_runs=200,
+    publication_runs=1000,
+    assumptions=(
+        "assumed: weights 1/2 in every fusion",
+        "the second density printed as p^1 is p^2",
+        "a run is one fusion by 5000 samples in all, drawn from the balanced mixture of both densities; each pair of "
+        "components gets its share of them: choosing sample by sample, as in (74), biases",
+        "@grid: the density itself by summation",
+        "covariance_intersection, harmonic_mean: of the Gaussians with the mixtures' moments",
+        "divergence: of the exact harmonic mean density from the fused mixture, or the Gaussian with the moments",
+    ),
+    sample=sample,
+    figures=figures,
+    charts=charts,
+    claims=(
+        Claim.order(
+            "The uncertainty of HMD-S is less than that of GMD-S: by samples.",
+            "5.2, Fig. 2",
+            "given-harmonic_mean@sampled/determinant_1",
+            "given-geometric_mean_sampling/determinant_1",
+        ),
+        Claim.order(
+            "The uncertainty of the harmonic mean is less than that of the geometric: the densities themselves.",
+            "5.2, Fig. 2",
+            "given-harmonic_mean@grid/determinant_1",
+            "given-geometric_mean_sampling@grid/determinant_1",
+        ),
+    ),
+    piece=50,
+    rules=RULE_CHOICES,
+    compare=PAIR.compare,
+)

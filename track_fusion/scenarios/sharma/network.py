@@ -1,0 +1,235 @@
+"""What the consistency tests of Sharma et al., sections 6.2 and 6.3, share: local filters, a network, its sink."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from track_fusion.linalg import Array, outer
+from track_fusion.metrics.accuracy import Estimate
+from track_fusion.metrics.consistency import nees
+from track_fusion.peers.peer import Peer, Round, communicate
+from track_fusion.random_streams import stream
+from track_fusion.rules import RULES
+from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
+from track_fusion.rules.ellipsoidal_intersection import EllipsoidalIntersectionParams
+from track_fusion.rules.harmonic_mean import HarmonicMeanParams
+from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
+from track_fusion.rules.naive import NaiveParams
+from track_fusion.study.chart import Chart, Series, ellipse
+from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, chosen, compare_each, fuse_runs
+
+RULE_CHOICES = (
+    RuleChoice("naive", NaiveParams()),
+    RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="trace")),
+    RuleChoice("inverse_covariance_intersection", InverseCovarianceIntersectionParams(criterion="trace")),
+    RuleChoice("ellipsoidal_intersection", EllipsoidalIntersectionParams()),
+    RuleChoice("harmonic_mean", HarmonicMeanParams(criterion="trace")),
+)
+#: An assumption of both tests.
+TRACE_WEIGHTS = (
+    "assumed: weights by the trace, of the fused covariance for CI and ICI, of the inverse covariance of the "
+    "denominator (77) for HMD-GA"
+)
+
+
+class Tracks(NamedTuple):
+    """One node's estimate in R runs: mean (R, n), cov (R, n, n), or (1, n, n) where all runs have the same."""
+
+    mean: Array
+    cov: Array
+
+
+class Local(NamedTuple):
+    """R runs before anything is sent: state (R, n), estimate of each node, and of one filter that saw all."""
+
+    state: Array
+    nodes: Mapping[str, Tracks]
+    centralised: Tracks
+
+
+@dataclasses.dataclass(frozen=True)
+class Network:
+    """Nodes that estimate, then send.
+
+    Attributes
+    ----------
+    estimate : callable        (runs, seed) -> Local
+    rounds : tuple of Round    who sends to whom; each receiver folds its senders in this order onto its own estimate
+    sink : str                 whose fused estimate is judged
+    """
+
+    estimate: Callable[[Sequence[int], int], Local]
+    rounds: tuple[Round, ...]
+    sink: str
+
+    def fused(self, local: Local, choice: RuleChoice, rngs: Sequence[np.random.Generator] | None = None) -> Tracks:
+        """Send estimates through the network, fused by a rule; return the sink's.
+
+        A rule that samples draws from each run's generator in `rngs`.
+        """
+
+        def fuse(own: Tracks, heard: Tracks, common: Tracks | None, count: int) -> Tracks:
+            size = max(len(own.cov), len(heard.cov))
+            covs = [np.broadcast_to(t.cov, (size, *t.cov.shape[1:])) for t in (own, heard)]
+            means = np.stack([own.mean, heard.mean], 1)
+            fused = fuse_runs(RULES[choice.key], choice.params, means, np.stack(covs, 1), rngs)
+            return Tracks(fused.mean, fused.cov)
+
+        peers = {name: Peer(tracks) for name, tracks in local.nodes.items()}
+        for sent in self.rounds:
+            peers = communicate(peers, sent, fuse)
+        return peers[self.sink].density
+
+
+#: Rows of each reading: one filter that saw all, and the rules.
+ROWS: dict[str, RuleChoice | None] = {"centralised": None} | {choice.name: choice for choice in RULE_CHOICES}
+#: What the paper calls the rows; those of one picture together, which would not all be told apart in one.
+PICTURES = (
+    {"centralised": "centralised", "naive": "naive", "harmonic_mean": "HMD-GA"},
+    {"covariance_intersection": "CI", "inverse_covariance_intersection": "ICI", "ellipsoidal_intersection": "EI"},
+)
+
+
+def row_name(row: str, reading: str = "") -> str:
+    """Name of a row in figures: kf-row, or kf-row@reading."""
+    return f"kf-{row}@{reading}" if reading else f"kf-{row}"
+
+
+def sample(
+    readings: Mapping[str, Network], runs: Sequence[int], seed: int, progress: Progress, only: str = ""
+) -> Samples:
+    """Run the rows whose names start with `only`, in every reading of the network ("" = as printed).
+
+    Returns
+    -------
+    {row/error: (R, n), row/cov: (R, n, n)} at the sink
+    """
+    wanted = chosen({row_name(row, reading): (reading, c) for reading in readings for row, c in ROWS.items()}, only)
+    local = {reading: readings[reading].estimate(runs, seed) for reading in {r for r, _ in wanted.values()}}
+    found: Samples = {}
+    for done, (name, (reading, choice)) in enumerate(wanted.items()):
+        start = local[reading]
+        fused = start.centralised if choice is None else readings[reading].fused(start, choice)
+        found[f"{name}/error"] = fused.mean - start.state
+        found[f"{name}/cov"] = np.broadcast_to(fused.cov, (len(runs), *fused.cov.shape[1:]))
+        progress((done + 1) / len(wanted))
+    return found
+
+
+def figures(samples: Samples) -> dict[str, Estimate]:
+    """Trace of the covariance reported and of the errors' own, and NEES over the number of axes."""
+    found = {}
+    for name in _rows(samples):
+        error, cov = samples[f"{name}/error"], samples[f"{name}/cov"]
+        found[f"{name}/reported_trace_1"] = Estimate.mean(np.trace(cov, axis1=1, axis2=2))
+        found[f"{name}/sample_trace_1"] = Estimate.mean((error**2).sum(1))
+        found[f"{name}/nees_1"] = Estimate.mean(nees(error, cov) / error.shape[1])
+    return found
+
+
+def _rows(samples: Samples) -> list[str]:
+    return [name.removesuffix("/error") for name in samples if name.endswith("/error")]
+
+
+def charts(readings: Mapping[str, str], samples: Samples) -> list[Chart]:
+    """Figs. 6 and 7: covariances at the sink, reported and of the errors; NEES of all rules.
+
+    Parameters
+    ----------
+    readings : reading -> what to call it in titles
+    """
+    found = []
+    for reading, title in readings.items():
+        for labels in PICTURES:
+            lines = [line for row in labels for line in _ellipses(samples, row, reading, labels[row])]
+            if lines:
+                found.append(Chart(f"{title}, 2 sigma", "x", "y", tuple(lines), equal=True))
+    measured = figures(samples)
+    bars = {_label(name): measured[f"{name}/nees_1"] for name in _rows(samples)}
+    place = np.arange(len(bars), dtype=float)
+    errors = np.nan_to_num([e.standard_error for e in bars.values()])
+    series = (
+        Series("", place, np.array([e.value for e in bars.values()]), "bars", errors),
+        Series("consistent", place[[0, -1]], np.ones(2), "dashed"),
+    )
+    ticks = dict(zip(place.tolist(), bars, strict=True))
+    return [*found, Chart("Squared errors over the covariance reported", "", "NEES / n", series, ticks=ticks)]
+
+
+def _label(name: str) -> str:
+    """Shorten the name of a row: CI@one_row."""
+    row, at, reading = name.removeprefix("kf-").partition("@")
+    return {**PICTURES[0], **PICTURES[1]}[row] + at + reading
+
+
+def _ellipses(samples: Samples, row: str, reading: str, label: str) -> list[Series]:
+    """Ellipses of the covariance that a row reports on average, and of its errors."""
+    name = row_name(row, reading)
+    if f"{name}/error" not in samples:
+        return []
+    error = samples[f"{name}/error"]
+    floor = 1e-12 * np.eye(error.shape[1])  # a single run's errors have a singular one
+    spread, origin = outer(error).mean(0) + floor, np.zeros(error.shape[1])
+    reported = ellipse(f"{label}, reported", origin, samples[f"{name}/cov"].mean(0))
+    return [reported, ellipse(f"{label}, errors", origin, spread, style="dashed")]
+
+
+def compare(
+    network: Network, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress
+) -> Samples:
+    """Fold by any rules: length of the error at the sink, (R,).
+
+    Raises
+    ------
+    ParameterError    a rule needs more than the tracks
+    """
+    local = network.estimate(runs, seed)
+
+    def measure(choice: RuleChoice) -> Samples:
+        rngs = [stream(seed, run, "rule") for run in runs]
+        return {"error_1": np.linalg.norm(network.fused(local, choice, rngs).mean - local.state, axis=1)}
+
+    return compare_each("kf", rules, progress, measure)
+
+
+# What the paper says of both tests.
+
+
+def in_order(text: str, source: str, quantity: str, *rows: str) -> Claim:
+    """Claim that a quantity ascends over rows."""
+    return Claim.order(text, source, *(f"kf-{row}/{quantity}" for row in rows))
+
+
+def by_nees(text: str, source: str, row: str, holds: Callable[[Estimate], bool]) -> Claim:
+    """Claim something of a row's NEES over the number of axes."""
+    return Claim(text, source, (f"kf-{row}/nees_1",), holds)
+
+
+def _consistent(nees_1: Estimate) -> bool:
+    """Tell whether NEES / n lies within 0.02 of 1, but for three standard errors."""
+    return bool(abs(nees_1.value - 1.0) - 3.0 * np.nan_to_num(nees_1.standard_error) <= 0.02)
+
+
+def conservative(nees_1: Estimate) -> bool:
+    """Tell whether NEES / n exceeds 1 by no more than three standard errors."""
+    return bool(nees_1.value - 3.0 * np.nan_to_num(nees_1.standard_error) <= 1.0)
+
+
+def common_claims(source: str) -> tuple[Claim, ...]:
+    """Claims of both sections."""
+    return (
+        by_nees("Centralised fusion is consistent: NEES / n within 0.02 of 1.", source, "centralised",
+                _consistent),
+        by_nees("Naive fusion is highly inconsistent: NEES / n above 1.5.", source, "naive", lambda e: e.value > 1.5),
+        by_nees("HMD-GA is consistent here: NEES / n not above 1.", source, "harmonic_mean", conservative),
+        in_order("HMD-GA reports the least, then ICI, then CI.", source, "reported_trace_1", "harmonic_mean",
+                 "inverse_covariance_intersection", "covariance_intersection"),
+        in_order("The actual error of HMD-GA is less than ICI's.", source, "sample_trace_1", "harmonic_mean",
+                 "inverse_covariance_intersection"),
+        in_order("The actual error of HMD-GA is less than CI's.", source, "sample_trace_1", "harmonic_mean",
+                 "covariance_intersection"),
+    )  # fmt: skip

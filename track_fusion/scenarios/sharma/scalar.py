@@ -1,0 +1,318 @@
+"""Sharma et al., section 6.1, Fig. 3: which weights the rules find for scalars, and what becomes of the estimate."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from track_fusion.linalg import Array
+from track_fusion.metrics.accuracy import Estimate, armse
+from track_fusion.random_streams import stream
+from track_fusion.rules import RULES
+from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
+from track_fusion.rules.harmonic_mean import HarmonicMeanParams
+from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
+from track_fusion.study.chart import Chart, Series
+from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario, chosen, compare_each, fuse_runs
+
+STEPS = 100
+
+
+class Setting(NamedTuple):
+    """Variance of the process noise in units of the measurement's, and the correlation of both."""
+
+    ratio: float
+    correlation: float
+
+    @property
+    def name(self) -> str:
+        """Such as q0_1_rho0_5."""
+        return f"q{self.ratio:g}_rho{self.correlation:g}".replace(".", "_").replace("-", "_minus_")
+
+
+#: The paper gives neither noise variances nor the correlation.
+SETTINGS = tuple(Setting(q, rho) for q in (0.1, 1.0, 10.0) for rho in (-0.5, 0.0, 0.5))
+RULE_CHOICES = (
+    RuleChoice("covariance_intersection", CovarianceIntersectionParams()),
+    RuleChoice("inverse_covariance_intersection", InverseCovarianceIntersectionParams()),
+    RuleChoice("harmonic_mean", HarmonicMeanParams()),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Pair:
+    """Two scalar tracks, each consistent, their errors correlated: variances, correlation, and how they are fused."""
+
+    variances: tuple[float, float]
+    correlation: float
+    choice: RuleChoice
+
+
+#: Whether HMD-GA is consistent: at the weights of (77), and at 1/2 near perfect correlation.
+PAIRS = {
+    "given-harmonic_mean@ratio10_rho0_9": Pair((1.0, 10.0), 0.9, RULE_CHOICES[-1]),
+    "given-harmonic_mean@half_ratio10_rho0_99": Pair(
+        (1.0, 10.0), 0.99, RuleChoice("harmonic_mean", HarmonicMeanParams(criterion="given", weights=(0.5, 0.5)))
+    ),
+}
+#: Pairs drawn in each run.
+DRAWS = 400
+
+
+def correlated(normals: Array, deviations: Sequence[float], correlation: float) -> tuple[Array, Array]:
+    """Turn independent standard normals (..., 2) into two numbers (...) of these deviations and correlation."""
+    second = correlation * normals[..., 0] + np.sqrt(1.0 - correlation**2) * normals[..., 1]
+    return deviations[0] * normals[..., 0], deviations[1] * second
+
+
+#: A generator a run, for rules that sample.
+Generators = Sequence[np.random.Generator]
+
+
+def fuse(
+    choice: RuleChoice, mean: Array, variance: Array, rngs: Generators | None = None
+) -> tuple[Array, Array, Array]:
+    """Fuse scalar tracks, mean and variance (R, 2): mean, variance and weight omega (R,), NaN where it has none."""
+    fused = fuse_runs(RULES[choice.key], choice.params, mean[..., None], variance[..., None, None], rngs)
+    weight = np.full(len(mean), np.nan) if fused.weights is None else fused.weights[:, 0]
+    return fused.mean[:, 0], fused.cov[:, 0, 0], weight
+
+
+class Track(NamedTuple):
+    """An estimate over the steps, (R, T): squared error, that over the claimed variance, weight omega."""
+
+    square: Array
+    nees: Array
+    weight: Array
+
+
+def track(setting: Setting, choice: RuleChoice | None, normals: Array, rngs: Generators | None = None) -> Track:
+    """Fuse prior and measurement at steps 1 to T; without a rule take the measurement.
+
+    Parameters
+    ----------
+    normals : (R, T + 1, 2)    standard; the first estimate is the measurement of step 0
+    rngs                       a generator a run, for a rule that samples
+    """
+    process, noise = correlated(normals, (np.sqrt(setting.ratio), 1.0), setting.correlation)
+    truth = np.cumsum(process, 1)
+    z = truth + noise
+    found = Track(*(np.empty((len(z), z.shape[1] - 1)) for _ in Track._fields))
+    estimate, variance, one = z[:, 0], np.ones(len(z)), np.ones(len(z))
+    for k in range(1, z.shape[1]):
+        if choice is None:
+            estimate, variance, weight = z[:, k], one, 0.0 * one
+        else:
+            pair = np.stack([estimate, z[:, k]], 1), np.stack([variance + setting.ratio, one], 1)
+            estimate, variance, weight = fuse(choice, *pair, rngs)
+        square = (estimate - truth[:, k]) ** 2
+        for values, value in zip(found, (square, square / variance, weight), strict=True):
+            values[:, k - 1] = value
+    return found
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """A setting, and the rule that fuses there; None = the measurement alone."""
+
+    setting: Setting
+    choice: RuleChoice | None
+
+
+def _rows() -> dict[str, Row]:
+    """Each rule, and the measurement alone, in each setting."""
+    choices: dict[str, RuleChoice | None] = {"alone": None}
+    choices |= {choice.name: choice for choice in RULE_CHOICES}
+    return {f"kf-{name}@{setting.name}": Row(setting, c) for name, c in choices.items() for setting in SETTINGS}
+
+
+ROWS = _rows()
+
+
+def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+    """Run the rows whose names start with `only`.
+
+    Returns
+    -------
+    {row/square, row/nees, row/weight: (R, T)}, and of given pairs {row/nees: (R,)}
+    """
+    rows: dict[str, Row | Pair] = chosen({**ROWS, **PAIRS}, only)
+    normals = _normals(runs, seed)
+    found: Samples = {}
+    for done, (name, row) in enumerate(rows.items()):
+        if isinstance(row, Pair):
+            found[f"{name}/nees"] = _pair_nees(row, runs, seed)
+        else:
+            found |= {
+                f"{name}/{column}": values
+                for column, values in track(row.setting, row.choice, normals)._asdict().items()
+            }
+        progress((done + 1) / len(rows))
+    return found
+
+
+def _normals(runs: Sequence[int], seed: int) -> Array:
+    return np.stack([stream(seed, run, "noise").standard_normal((STEPS + 1, 2)) for run in runs])
+
+
+def _pair_nees(pair: Pair, runs: Sequence[int], seed: int) -> Array:
+    """Average over the pairs drawn in each run, (R,)."""
+    normals = np.stack([stream(seed, run, "pairs").standard_normal((DRAWS, 2)) for run in runs])
+    errors = np.stack(correlated(normals.reshape(-1, 2), np.sqrt(pair.variances).tolist(), pair.correlation), 1)
+    mean, variance, _ = fuse(pair.choice, errors, np.broadcast_to(pair.variances, errors.shape))
+    return np.asarray((mean**2 / variance).reshape(len(runs), DRAWS).mean(1))
+
+
+def figures(samples: Samples) -> dict[str, Estimate]:
+    """Weight, averaged over steps and runs; root-mean-square error, averaged over steps; NEES."""
+    found = {}
+    for name, values in samples.items():
+        row, _, column = name.rpartition("/")
+        if column == "square":
+            found[f"{row}/armse_1"] = armse(values)
+        elif column == "nees" or not row.startswith("kf-alone"):
+            found[f"{row}/{column}_1"] = Estimate.mean(values.reshape(len(values), -1).mean(1))
+    return found
+
+
+def charts(samples: Samples) -> list[Chart]:
+    """Fig. 3 for each ratio of the noises: weights over the steps, averaged over runs; error and NEES by setting."""
+    found = []
+    for ratio in dict.fromkeys(s.ratio for s in SETTINGS):
+        lines = []
+        for setting in (s for s in SETTINGS if s.ratio == ratio):
+            for choice in RULE_CHOICES:
+                name = f"kf-{choice.name}@{setting.name}/weight"
+                # Where all correlations give the same line, one is enough.
+                if name in samples and (choice.key == "harmonic_mean" or setting.correlation == 0.0):
+                    lines.append(_weights(choice, setting, samples[name]))
+        if lines:
+            found.append(Chart(f"Weights of the prior, q = {ratio:g} r", "step", "weight omega", tuple(lines)))
+    return found + _bars(samples)
+
+
+def _weights(choice: RuleChoice, setting: Setting, values: Array) -> Series:
+    harmonic = choice.key == "harmonic_mean"
+    label = f"HMD-GA, rho {setting.correlation:g}" if harmonic else RULES[choice.key].title
+    return Series(label, np.arange(1.0, values.shape[1] + 1), values.mean(0), "line" if harmonic else "dashed")
+
+
+def _bars(samples: Samples) -> list[Chart]:
+    """NEES of HMD-GA by setting."""
+    measured = figures(samples)
+    bars = {n.rpartition("@")[2].removesuffix("/nees_1"): e for n, e in measured.items()
+            if n.endswith("/nees_1") and "harmonic_mean" in n}  # fmt: skip
+    if not bars:
+        return []
+    place = np.arange(len(bars), dtype=float)
+    values, errors = np.array([e.value for e in bars.values()]), np.array([e.standard_error for e in bars.values()])
+    lines = (
+        Series("", place, values, "bars", np.nan_to_num(errors)),
+        Series("consistent", place[[0, -1]], np.ones(2), "dashed"),
+    )
+    ticks = dict(zip(place.tolist(), bars, strict=True))
+    return [Chart("HMD-GA: squared error over the claimed variance", "", "NEES", lines, ticks=ticks)]
+
+
+def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+    """Run any rules in every setting: root of the squared error averaged over the steps, (R,).
+
+    Raises
+    ------
+    ParameterError    a rule needs more than the two tracks
+    """
+    normals = _normals(runs, seed)
+
+    def measure(choice: RuleChoice) -> Samples:
+        found = {}
+        for setting in SETTINGS:
+            rngs = [stream(seed, run, "rule") for run in runs]
+            found[f"rmse_{setting.name}_1"] = np.sqrt(track(setting, choice, normals, rngs).square.mean(1))
+        return found
+
+    return compare_each("kf", rules, progress, measure)
+
+
+def _names(row: str, quantity: str) -> tuple[str, ...]:
+    return tuple(f"kf-{row}@{setting.name}/{quantity}" for setting in SETTINGS)
+
+
+def _consistent(*nees: Estimate) -> bool:
+    """Tell whether no squared error exceeds its claim by more than three standard errors."""
+    return all(e.value - 3.0 * np.nan_to_num(e.standard_error) <= 1.0 for e in nees)
+
+
+def _same(*errors: Estimate) -> bool:
+    """Tell whether the first half of the figures equals the second, number by number."""
+    half = len(errors) // 2
+    return all(abs(a.value - b.value) <= 1e-9 * b.value for a, b in zip(errors[:half], errors[half:], strict=True))
+
+
+CLAIMS = (
+    Claim(
+        "The weight of CI is always 0.", "6.1, Fig. 3",
+        _names("covariance_intersection", "weight_1"), lambda *w: all(e.value == 0.0 for e in w),
+    ),
+    Claim(
+        "The weight of ICI is always 1.", "6.1, Fig. 3",
+        _names("inverse_covariance_intersection", "weight_1"), lambda *w: all(e.value == 1.0 for e in w),
+    ),
+    Claim(
+        "CI gives the measurement itself.", "6.1",
+        _names("covariance_intersection", "armse_1") + _names("alone", "armse_1"), _same,
+    ),
+    Claim(
+        "ICI gives the measurement itself.", "6.1",
+        _names("inverse_covariance_intersection", "armse_1") + _names("alone", "armse_1"), _same,
+    ),
+    Claim(
+        "The weight of HMD-GA is 0.2 on average: within 0.05 somewhere on the grid.", "6.1, Fig. 3",
+        _names("harmonic_mean", "weight_1"), lambda *w: any(abs(e.value - 0.2) <= 0.05 for e in w),
+    ),
+    Claim(
+        "HMD-GA gives the measurement more weight than the prior: everywhere on the grid.", "6.1",
+        _names("harmonic_mean", "weight_1"), lambda *w: all(0.0 < e.value < 0.5 for e in w),
+    ),
+    Claim(
+        "HMD-GA is consistent: in this problem, everywhere on the grid.", "7",
+        _names("harmonic_mean", "nees_1"), _consistent,
+    ),
+    Claim(
+        "HMD-GA is consistent: variances 1 and 10, correlation 0.9, weights by (77).", "4.2, 7",
+        ("given-harmonic_mean@ratio10_rho0_9/nees_1",), _consistent,
+    ),
+    Claim(
+        "HMD-GA is consistent near perfect correlation: variances 1 and 10, correlation 0.99, weights 1/2.", "4.2",
+        ("given-harmonic_mean@half_ratio10_rho0_99/nees_1",), _consistent,
+    ),
+)  # fmt: skip
+
+SCENARIO = Scenario(
+    key="sharma-scalar",
+    title="A scalar random walk, prior and measurement fused",
+    paper="Sharma et al., Harmonic Mean Density Fusion in Distributed Tracking, 6.1, Fig. 3",
+    shows="that weights by their own covariance make CI and ICI drop the prior, and what HMD-GA does instead",
+    published={},
+    published_runs=500,
+    default_runs=500,
+    publication_runs=500,
+    assumptions=(
+        "assumed: process noise of 0.1, 1 and 10 times the measurement noise's variance 1, correlation -0.5, 0 and 0.5 "
+        "of the two noises of a step: a small grid, since the paper gives none of them",
+        "assumed: 100 steps, the first estimate is the measurement of step 0 with its variance",
+        "omega as in (77)-(79), track 1 the prior: the weight of the prior for CI, of the measurement in the common "
+        "part for ICI, of the prior in the harmonic mean for HMD-GA",
+        "the average weight 0.2 is read off a figure at unknown noise: judged as a claim, not as a figure",
+        "given pairs: two consistent tracks of variances 1 and 10 whose errors are correlated, 400 pairs a run",
+    ),
+    sample=sample,
+    figures=figures,
+    charts=charts,
+    claims=CLAIMS,
+    piece=50,
+    rules=RULE_CHOICES,
+    compare=compare,
+)
