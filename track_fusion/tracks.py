@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from track_fusion.linalg import ASYMMETRY_TOLERANCE, Array, is_positive_definite, outer, symmetrise, transpose
 
+#: Times are integers of nanoseconds.
+SECOND_NS = 1_000_000_000
+
 # Bits of `status`.
 CONFIRMED = 1
 COASTED = 2  # no source supported the track at its time

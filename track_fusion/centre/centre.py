@@ -19,9 +19,8 @@ from track_fusion.params import ParameterError, Params, param
 from track_fusion.random_streams import RandomParams
 from track_fusion.rules import RULES, FusedTracks, Mixture, Rule, SourceTracks
 from track_fusion.solvers.chi_square import chi_square_quantile
-from track_fusion.tracks import COASTED, CONFIRMED, TrackBatch
+from track_fusion.tracks import COASTED, CONFIRMED, SECOND_NS, TrackBatch
 
-SECOND_NS = 1_000_000_000
 #: Added to variances that may be zero, as those of particles that coincide; SI units squared.
 LEAST_VARIANCE = 1e-24
 

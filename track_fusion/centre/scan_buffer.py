@@ -7,9 +7,7 @@ from collections import Counter, deque
 from collections.abc import Sequence
 
 from track_fusion.params import Params, param
-from track_fusion.tracks import TrackBatch
-
-SECOND_NS = 1_000_000_000
+from track_fusion.tracks import SECOND_NS, TrackBatch
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.params import ParameterError, Params, param
-from track_fusion.tracks import COASTED, CONFIRMED, StateLayout, TrackBatch
+from track_fusion.tracks import COASTED, CONFIRMED, SECOND_NS, StateLayout, TrackBatch
 
 Bools = NDArray[np.bool_]
 #: Updates that a history remembers: its width in bits.
@@ -119,7 +119,7 @@ class TrackManager:
         limit, last = self._params.deletion_threshold
         missed = _ones(~self._history & _mask(np.minimum(self._updates, last))) >= limit
         worn_out = np.all(missed | ~self._hit_ever, axis=1)
-        overdue = time_ns - self._supported_ns > round(self._params.max_coast_s * 1e9)
+        overdue = time_ns - self._supported_ns > round(self._params.max_coast_s * SECOND_NS)
         return np.asarray(worn_out | overdue)
 
     def _keep(self, rows: Bools) -> None:

@@ -11,8 +11,8 @@ from typing import Any
 
 from track_fusion.nodes.managed import Fault, ManagedNode, qos
 from track_fusion.params import ParameterError, Params, param
+from track_fusion.tracks import SECOND_NS
 
-SECOND_NS = 1_000_000_000
 #: At most this much bag time passes between two /clock messages, wall time permitting.
 CLOCK_PERIOD_S = 0.01
 

@@ -10,6 +10,7 @@ from typing import Any
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 
+from msg_adapters.header import stamp_to_ns
 from msg_adapters.odometry import odometry_from_msg
 from msg_adapters.track_table import track_table_from_msg
 from track_fusion.metrics.evaluation import Evaluation, EvaluationParams
@@ -55,7 +56,7 @@ class EvaluatorNode(ManagedNode):
         self._check()
 
     def _on_tracks(self, msg: Any) -> None:
-        stamp_ns = msg.header.stamp.sec * 1_000_000_000 + msg.header.stamp.nanosec
+        stamp_ns = stamp_to_ns(msg.header.stamp)
         self.evaluation.add_tracks(stamp_ns, screened_tracks(self, track_table_from_msg(msg), self.layout))
         self._check()
 

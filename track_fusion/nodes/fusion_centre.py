@@ -27,7 +27,7 @@ from track_fusion.nodes.screening import FrameParams, screened_tracks
 from track_fusion.params import ParameterError, Params, param
 from track_fusion.random_streams import RandomParams
 from track_fusion.rules import RULES
-from track_fusion.tracks import StateLayout, TrackBatch
+from track_fusion.tracks import SECOND_NS, StateLayout, TrackBatch
 
 #: Provenance has 32 bits.
 MAX_SOURCES = 32
@@ -120,9 +120,10 @@ class FusionCentreNode(ManagedNode):
     def _reader(self, source: int, kind: str) -> Callable[[Any], None]:
         def read(msg: Any) -> None:
             now = self.now_ns()
-            check_header(msg.header, frame_id=self.frame.frame_id, now_ns=now, max_future_ns=self.frame.max_future_ns)
+            stamp_ns = check_header(
+                msg.header, frame_id=self.frame.frame_id, now_ns=now, max_future_ns=self.frame.max_future_ns
+            )
             arrays = track_table_from_msg(msg) if kind == "track_table" else self._read_odometry(msg)
-            stamp_ns = msg.header.stamp.sec * 1_000_000_000 + msg.header.stamp.nanosec
             self._take(source, screened_tracks(self, arrays, self.centre.layout), stamp_ns, now)
 
         return read
@@ -148,7 +149,7 @@ class FusionCentreNode(ManagedNode):
     def _look_at(self, now: int) -> None:
         """Fuse what has waited long enough; when all sources are silent, let the tracks coast."""
         self._advance(now)
-        idle = now - self.buffer.fused_ns >= self._buffer_params.source_timeout_s * 1e9
+        idle = now - self.buffer.fused_ns >= self._buffer_params.source_timeout_s * SECOND_NS
         if idle and len(self.centre.tracks) and self.buffer.all_silent(now):
             self.buffer.fused_ns = now
             self._step(now, {})

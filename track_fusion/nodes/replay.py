@@ -15,16 +15,15 @@ from sensor_msgs.msg import PointCloud2
 
 from msg_adapters.arrays import DetectionArrays
 from msg_adapters.detection_table import detection_table_to_msg
-from msg_adapters.header import stamp_from_ns
+from msg_adapters.header import stamp_from_ns, stamp_to_ns
 from msg_adapters.odometry import odometry_to_msgs
 from track_fusion.nodes.bag_player import BagParams, BagPlayer
 from track_fusion.nodes.managed import Fault, ManagedNode, end, qos, run
 from track_fusion.nodes.ros_params import declare
 from track_fusion.params import ParameterError, Params, param, unknown_name_error
 from track_fusion.scenarios import SCENARIOS, get_scenario
-from track_fusion.tracks import TrackBatch
+from track_fusion.tracks import SECOND_NS, TrackBatch
 
-SECOND_NS = 1_000_000_000
 #: How often the state of the network and the deadline are looked at, wall time.
 LOOK_PERIOD_S = 0.02
 #: At the end, readers that are still there take the last messages within this wall time.
@@ -199,7 +198,7 @@ class ReplayNode(ManagedNode):
             pub.publish(detection_table_to_msg(scan))
 
     def _on_fused(self, msg: Any) -> None:
-        stamp_ns = msg.header.stamp.sec * SECOND_NS + msg.header.stamp.nanosec
+        stamp_ns = stamp_to_ns(msg.header.stamp)
         if self._started and stamp_ns == self._stamp_ns():
             self.counted["results"] += 1
             self._next()

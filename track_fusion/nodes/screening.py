@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from msg_adapters.arrays import DetectionArrays, MessageError, TrackArrays
 from track_fusion.linalg import Array, is_positive_definite, symmetrise
 from track_fusion.params import Params, param
-from track_fusion.tracks import ABSURD, StateLayout, TrackBatch
+from track_fusion.tracks import ABSURD, SECOND_NS, StateLayout, TrackBatch
 
 if TYPE_CHECKING:
     from track_fusion.nodes.managed import ManagedNode
@@ -30,7 +30,7 @@ class FrameParams(Params):
     @property
     def max_future_ns(self) -> int:
         """The same in nanoseconds."""
-        return round(self.max_future_s * 1e9)
+        return round(self.max_future_s * SECOND_NS)
 
 
 def screened_tracks(node: ManagedNode, arrays: TrackArrays, layout: StateLayout) -> TrackBatch:

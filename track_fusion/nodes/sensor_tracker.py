@@ -29,7 +29,7 @@ from track_fusion.trackers.one_target import (
     SensorTrackerParams,
     TrackerChoice,
 )
-from track_fusion.tracks import StateLayout, TrackBatch
+from track_fusion.tracks import SECOND_NS, StateLayout, TrackBatch
 
 #: How often a tracker that waits for feedback looks at its deadline.
 LOOK_PERIOD_S = 0.05
@@ -132,7 +132,7 @@ class SensorTrackerNode(ManagedNode):
 
     def _on_deadline(self) -> None:
         waited = self._wall.now().nanoseconds - self._asked_ns
-        if self._awaited_ns >= 0 and self._queue and waited > self.feedback.feedback_timeout_s * 1e9:
+        if self._awaited_ns >= 0 and self._queue and waited > self.feedback.feedback_timeout_s * SECOND_NS:
             self.counted["feedback_timeouts"] += 1
             self._awaited_ns = -1
             self._work()

@@ -26,9 +26,8 @@ from track_fusion.models.base import Motion
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.params import param
 from track_fusion.solvers.chi_square import chi_square_quantile
-from track_fusion.tracks import CONFIRMED, TrackBatch
+from track_fusion.tracks import CONFIRMED, SECOND_NS, TrackBatch
 
-SECOND_NS = 1_000_000_000
 #: Detections are searched in boxes around the gates, wider by this share of themselves.
 ROUNDING = 1e-9
 #: A detection counts as claimed when it is a track's with at least this probability.

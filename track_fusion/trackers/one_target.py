@@ -12,9 +12,8 @@ from track_fusion.models.choices import SENSORS, MotionChoice, square_matrix
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.params import ParameterError, Params, param
 from track_fusion.trackers.filters import TRACK_FILTERS, TrackFilter
-from track_fusion.tracks import COASTED, CONFIRMED, StateLayout, TrackBatch
+from track_fusion.tracks import COASTED, CONFIRMED, SECOND_NS, StateLayout, TrackBatch
 
-SECOND_NS = 1_000_000_000
 #: The tracker of any number of targets in clutter, pda_tracker.py.
 MULTI_TARGET = "pda"
 

@@ -25,7 +25,7 @@ from track_fusion.rules.naive import NaiveParams
 from track_fusion.scenarios.sharma.surveillance import Courses, Radar, Surveillance
 from track_fusion.study.scenario import Progress, RuleChoice, Samples
 from track_fusion.trackers.many_targets import PdaTracker, PdaTrackerParams
-from track_fusion.tracks import TrackBatch, planar_layout
+from track_fusion.tracks import SECOND_NS, TrackBatch, planar_layout
 
 #: Table 3: latitude and longitude (degrees north, east) of each target at its start and at its end.
 TARGETS = (
@@ -67,7 +67,6 @@ SCAN_S, STEPS = 2.0, 150
 FUSION_SCANS = 5
 #: A target without a central track so near is lost, a track without such a target false.
 REACH_M = 3000.0
-SECOND_NS = 1_000_000_000
 
 MOTION = NearlyConstantVelocity(LAYOUT, MotionParams(noise_form="continuous", process_noise=10.0))
 TRACKER = PdaTrackerParams(
