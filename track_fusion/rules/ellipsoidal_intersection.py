@@ -9,7 +9,7 @@ import numpy as np
 from track_fusion.linalg import Array
 from track_fusion.params import Params
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.pairwise import PairFusion, fold
+from track_fusion.rules.shared.folding import PairFusion, fold
 from track_fusion.solvers.pair import Pair
 
 
