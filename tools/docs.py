@@ -95,7 +95,7 @@ def choosing_page() -> str:
     """Return doc/choosing-a-rule.md, written by hand but for its table of promises."""
     from track_fusion.rules import RULES
 
-    rows = [(f"[`{r.key}`](rules.md#{r.key})", r.guarantee, r.caveat, r.cost, r.source) for r in RULES.values()]
+    rows = [(f"[`{r.key}`](rules.md#{r.key})", r.guarantee, r.caveat, r.cost, r.source) for r in RULES.own.values()]
     table = _table(("rule", "promise", "when, or what breaks it", "cost", "source"), rows)
     text = (SOURCE_TREE / "doc" / "choosing-a-rule.md").read_text(encoding="utf-8")
     return _TABLE.sub(lambda found: f"{found[1]}{table}\n{found[2]}", text)
@@ -106,7 +106,7 @@ def rules_page() -> str:
     from track_fusion.cli.rules import describe
     from track_fusion.rules import RULES
 
-    described = [describe(rule) for rule in RULES.values()]
+    described = [describe(rule) for rule in RULES.own.values()]
     columns = ("rule", "family", "tracks", "guarantee", "source", "cost")
     rows = [(f"[`{r['key']}`](#{r['key']})", r["family"], r["arity"], r["guarantee"], r["source"], r["cost"])
             for r in described]  # fmt: skip
@@ -199,9 +199,9 @@ def fusion_centre_sections() -> list[Section]:
     used = "read when state_fusion is"
     return [
         *map(Section, (FrameParams, SourceParams, MotionChoice)),
-        *_alternatives("motion", MOTIONS, MotionChoice().motion),
+        *_alternatives("motion", MOTIONS.own, MotionChoice().motion),
         Section(FusionCentreParams),
-        *(Section(r.params, f"{key}.", f"{r.title}: {used} {key}.") for key, r in RULES.items() if specs(r.params)),
+        *(Section(r.params, f"{key}.", f"{r.title}: {used} {key}.") for key, r in RULES.own.items() if specs(r.params)),
         *map(Section, (ScanBufferParams, TrackManagerParams)),
         Section(RandomParams, title="Random numbers of rules that draw samples: seed, run and role name a stream."),
         Section(ManagedParams),
@@ -222,7 +222,7 @@ def sensor_tracker_sections() -> list[Section]:
     filters: dict[str, Choice[Any]] = {**TRACK_FILTERS, MULTI_TARGET: Choice(PdaTrackerParams, PdaTracker)}
     return [
         *map(Section, (FrameParams, TrackerChoice)),
-        *_alternatives("motion", MOTIONS, default.motion),
+        *_alternatives("motion", MOTIONS.own, default.motion),
         *_alternatives("sensor", SENSORS, default.sensor),
         *_alternatives("filter", filters, default.filter),
         *map(Section, (SensorTrackerParams, FeedbackParams, OutputParams, ManagedParams)),

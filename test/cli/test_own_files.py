@@ -32,7 +32,7 @@ def registry() -> Iterator[None]:
     before = set(RULES)
     yield
     for key in RULES.keys() - before:
-        del RULES[key]
+        del RULES.own[key]
 
 
 def pages_commands(page: str) -> list[str]:

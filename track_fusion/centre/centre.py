@@ -31,7 +31,7 @@ Rows = NDArray[np.intp]
 class FusionCentreParams(Params):
     """What takes part in a fusion and how it is associated."""
 
-    state_fusion: str = param("covariance_intersection", "the fusion rule", choices=tuple(RULES))
+    state_fusion: str = param("covariance_intersection", "the fusion rule", choices=RULES)
     association: str = param(
         "nearest",
         "nearest: global nearest neighbour within the gate; single_target: all sources are known to track one and the "

@@ -83,7 +83,8 @@ class FusionCentreNode(ManagedNode):
         self.frame, self.sources = declare(self, FrameParams), declare(self, SourceParams)
         motion = chosen(self, MOTIONS, declare(self, MotionChoice).motion, StateLayout(self.frame.axes))
         params = declare(self, FusionCentreParams)
-        rule_params = {key: declare(self, rule.params, f"{key}.") for key, rule in RULES.items()}
+        rules = {**RULES.own, params.state_fusion: RULES[params.state_fusion]}
+        rule_params = {key: declare(self, rule.params, f"{key}.") for key, rule in rules.items()}
         self.centre = FusionCentre(
             len(self.sources.source_configurations), motion, self.frame.frame_id, params,
             rule_params[params.state_fusion], declare(self, TrackManagerParams), random=declare(self, RandomParams),

@@ -11,8 +11,8 @@ from track_fusion.densities.gaussian import merge, merge_near
 from track_fusion.densities.mixture.algebra import average
 from track_fusion.linalg import Array
 from track_fusion.params import param
-from track_fusion.rules.base import FusedTracks, Mixture, Rule, SourceTracks
-from track_fusion.rules.shared.weights import WeightParams, diagnostics
+from track_fusion.rules.base import Example, FusedTracks, Mixture, Rule, SourceTracks
+from track_fusion.rules.shared.weights import GIVEN, UNIFORM, WeightParams, diagnostics
 from track_fusion.solvers.optimise import Solution
 from track_fusion.weights.bound import bound_weights
 from track_fusion.weights.merging import merging_weights
@@ -134,6 +134,11 @@ def _by_likelihood(tracks: SourceTracks) -> Array:
     return np.asarray(share / share.sum(-1, keepdims=True))
 
 
+EXAMPLES = (
+    {**UNIFORM, "output": "mixture"}, GIVEN, {"criterion": "bound"}, {"criterion": "target"},
+    {"criterion": "likelihood"}, {"output": "mixture", "merge_threshold": 1.5},
+)  # fmt: skip
+
 RULE = Rule(
     key="arithmetic_average",
     title="Arithmetic average",
@@ -147,4 +152,5 @@ RULE = Rule(
     cost="K n^3, about ten times that for weights that are sought with K > 2",
     needs_when=(("target", "criterion", "target"), ("likelihood", "criterion", "likelihood")),
     takes_particles=True,
+    example=Example(({}, *EXAMPLES), (UNIFORM, GIVEN), idempotent=True),
 )

@@ -88,6 +88,28 @@ class FusedTracks:
         return FusedTracks(shape(self.mean), shape(self.cov), weights, dof, mixture, info)
 
 
+Values = Mapping[str, Any]
+#: Stands in an example for one weight a source, unequal and of sum 1.
+EACH: Any = ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Example:
+    """What the laws of `contract` need to know beyond the descriptor: at which parameters a rule is tried, and how."""
+
+    params: tuple[Values, ...] = ({},)
+    guaranteed: tuple[Values, ...] = ({},)  # where the guarantee holds
+    not_equivariant: tuple[Values, ...] = ()  # where the result depends on axes and units, if the claim is a text
+    idempotent: bool | None = None  # whether copies of one track fuse to that track; None: not stated
+    #: by how many standard deviations moments may vary with the random numbers, if every sample is effective; where
+    #: parameters name a number of samples
+    monte_carlo: float = 0.0
+    #: (rng, tracks) -> extras that the rule needs and that `contract.EXTRAS` does not know
+    extras: Callable[[np.random.Generator, SourceTracks], Mapping[str, Any]] | None = None
+    #: for guarantee none or structural: the true error variance over the claimed one, measured and as stated
+    counter_example: Callable[[], tuple[float, float]] | None = None
+
+
 @dataclasses.dataclass(frozen=True)
 class Rule:
     """The descriptor from which ROS parameters, the rules table and the contract tests are made."""
@@ -112,6 +134,7 @@ class Rule:
     affine_equivariant: bool | str = True  # a string says why not, or under which parameters
     takes_particles: bool = False  # components without covariance; the fusion centre gives other rules their Gaussian
     linear: bool = False  # the fused mean is linear in the means; all else depends on the covariances alone
+    example: Example = Example()
 
     def __call__(self, tracks: SourceTracks, params: Params | None = None) -> FusedTracks:
         """Check the tracks, then fuse them; `fuse` alone trusts them, for callers that screened them before.

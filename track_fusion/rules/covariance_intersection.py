@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from track_fusion.densities.gaussian import keep_sole, weighted_product
 from track_fusion.linalg import Array, inverse, matvec, outer, symmetrise, transpose
 from track_fusion.params import param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.shared.weights import WeightParams, diagnostics, pooled
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks, Values
+from track_fusion.rules.shared.weights import GIVEN, TRACE, UNIFORM, WeightParams, diagnostics, pooled
 from track_fusion.solvers.optimise import (
     Derivatives,
     ScalarDerivatives,
@@ -260,6 +260,8 @@ def _trace(a: Array) -> Array:
     return np.asarray(np.trace(a, axis1=-2, axis2=-1))
 
 
+EXAMPLES: tuple[Values, ...] = ({}, TRACE, UNIFORM, GIVEN)
+
 RULE = Rule(
     key="covariance_intersection",
     title="Covariance intersection",
@@ -273,4 +275,5 @@ RULE = Rule(
     cost="K n^3, about ten times that for K > 2",
     linear=True,
     affine_equivariant="not with criterion trace: the trace depends on the units of the axes",
+    example=Example(EXAMPLES, EXAMPLES, (TRACE,), idempotent=True),
 )

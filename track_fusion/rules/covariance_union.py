@@ -9,8 +9,8 @@ import numpy as np
 
 from track_fusion.linalg import outer
 from track_fusion.params import Params, param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.shared.weights import check_weights, diagnostics
+from track_fusion.rules.base import EACH, Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.weights import TRACE, check_weights, diagnostics
 from track_fusion.solvers.upper_bound import bound_about, bound_anywhere
 from track_fusion.weights.merging import merging_weights
 
@@ -95,6 +95,8 @@ def fuse(tracks: SourceTracks, params: CovarianceUnionParams) -> FusedTracks:
     return FusedTracks(mean, sides[np.arange(len(sides)), chosen], share).shaped(tracks.batch)
 
 
+UNEQUAL = (TRACE, {**TRACE, "mean": "optimal"}, {"bound": "max_trace"}, {"bound": "min_trace"})
+
 RULE = Rule(
     key="covariance_union",
     title="Covariance union",
@@ -107,4 +109,10 @@ RULE = Rule(
     source="Li 2022 (7)-(9)",
     cost="n^3 for K = 2, else some twelve times K n^6",
     affine_equivariant="not with a trace, whether as criterion or as bound: it depends on the units of the axes",
+    example=Example(
+        ({}, {"weights": EACH}, {"mean": "diversity"}, {"mean": "optimal"}, *UNEQUAL),
+        ({}, TRACE),
+        UNEQUAL,
+        idempotent=True,
+    ),
 )

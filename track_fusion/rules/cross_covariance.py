@@ -8,7 +8,7 @@ import numpy as np
 
 from track_fusion.linalg import Array, is_positive_definite, matvec, symmetrise, transpose
 from track_fusion.params import Params, param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
 
 #: An eigenvalue of the joint correlation may be so far below zero by rounding.
 ROUNDING = 1e-9
@@ -133,4 +133,5 @@ RULE = Rule(
     source="Sharma 1 (Bar-Shalom and Campo)",
     cost="K^3 n^3",
     needs_when=(("cross_cov", "method", "given"),),
+    example=Example(({}, {"method": "given"}), ({"method": "given"},), idempotent=False),
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from track_fusion.params import Params
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
 from track_fusion.rules.shared.weights import pooled_by
 from track_fusion.weights.pooling import chernoff_weights
 
@@ -56,4 +56,5 @@ RULE = Rule(
     caveat="the weights depend on the means: errors a few percent above the claim are possible",
     source="Chen 2022; Ahmed (9)-(10)",
     cost="K n^3, about ten times that for K > 2",
+    example=Example(idempotent=True),
 )

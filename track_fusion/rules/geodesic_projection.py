@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 from track_fusion.densities.elliptical.projection import nearest_mean
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.shared.elliptical import EllipticalParams, each, family_of, family_param
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.elliptical import HEAVY_TAILS, EllipticalParams, each, family_of, family_param
 from track_fusion.rules.shared.weights import pooled_by
 
 
@@ -64,4 +64,5 @@ RULE = Rule(
     caveat="weights follow the means: a rare large error that most tracks share exceeds what is claimed by 42 %",
     source="Chen 2022 (45), (49)-(50), section 5",
     cost="K n^3, about ten times",
+    example=Example(({}, {"family": "student_t"}, HEAVY_TAILS), idempotent=True),
 )

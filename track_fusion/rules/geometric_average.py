@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 from track_fusion.params import param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.shared.weights import WeightParams, pooled, pooled_by
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.weights import GIVEN, WeightParams, pooled, pooled_by
 from track_fusion.weights.pooling import chernoff_weights, minimax_weights
 
 
@@ -55,6 +55,8 @@ def fuse(tracks: SourceTracks, params: GeometricAverageParams) -> FusedTracks:
     return pooled_by(chernoff_weights if params.criterion == "chernoff" else minimax_weights, tracks)
 
 
+SOUGHT = ({"criterion": "chernoff"}, {"criterion": "minimax_information_loss"})
+
 RULE = Rule(
     key="geometric_average",
     title="Geometric average",
@@ -66,4 +68,7 @@ RULE = Rule(
     caveat="at weights that do not depend on the means (uniform, given), if every track is",
     source="Li 2022 (15)-(17); Ahmed (9)-(11)",
     cost="K n^3, about ten times that for weights that are sought",
+    example=Example(
+        ({}, {"criterion": "chernoff"}, {"criterion": "minimax_information_loss"}, GIVEN), ({}, GIVEN), idempotent=True
+    ),
 )

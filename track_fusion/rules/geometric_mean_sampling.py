@@ -12,9 +12,10 @@ from track_fusion.densities.mean_density import fit_mean_density, sample_mean_de
 from track_fusion.densities.mixture.algebra import LogMixture, product
 from track_fusion.densities.mixture.mixture import Mixture, chosen, same
 from track_fusion.params import param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
 from track_fusion.rules.shared.mixtures import AverageParams, ReductionParams, fused_tracks, nth
 from track_fusion.rules.shared.sampling import Generators, fuse_sampled
+from track_fusion.rules.shared.weights import GIVEN
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,4 +103,5 @@ RULE = Rule(
     source="Sharma (61)-(65), (67)-(73)",
     cost="K S n^2 for S samples",
     optional=("seed",),
+    example=Example(({"samples": 5000}, {**GIVEN, "samples": 5000}), idempotent=True, monte_carlo=0.15),
 )

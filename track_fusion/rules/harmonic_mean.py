@@ -12,11 +12,11 @@ from track_fusion.densities.mixture.algebra import LogMixture, product
 from track_fusion.densities.mixture.mixture import Mixture, chosen, moments, same, stacked
 from track_fusion.linalg import Array, matvec, outer, transpose
 from track_fusion.params import param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
 from track_fusion.rules.shared.folding import PairFusion, Step, fold, fold_mixtures, share_of_first
 from track_fusion.rules.shared.mixtures import ReductionParams
 from track_fusion.rules.shared.sampling import Generators, fuse_sampled
-from track_fusion.rules.shared.weights import WeightParams
+from track_fusion.rules.shared.weights import GIVEN, TRACE, WeightParams
 from track_fusion.solvers.optimise import Derivatives, Solution, minimise_on_interval
 from track_fusion.solvers.pair import Pair
 from track_fusion.weights.merging import pair_derivatives
@@ -194,4 +194,8 @@ RULE = Rule(
     optional=("seed",),
     optional_when=(("seed", "method", "sampling"),),
     affine_equivariant="not with criterion trace: the trace depends on the units of the axes",
-)
+    example=Example(
+        ({}, TRACE, GIVEN, {"method": "sampling", "samples": 5000}),
+        not_equivariant=(TRACE,), idempotent=True, monte_carlo=0.15,
+    ),
+)  # fmt: skip

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from track_fusion.linalg import Array
 from track_fusion.params import param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
 from track_fusion.rules.shared.folding import PairFusion, fold
-from track_fusion.rules.shared.weights import WeightParams
+from track_fusion.rules.shared.weights import GIVEN, TRACE, WeightParams
 from track_fusion.solvers.optimise import Derivatives, Solution, minimise_on_interval
 from track_fusion.solvers.pair import Pair
 
@@ -118,4 +118,5 @@ RULE = Rule(
     order_matters=True,
     affine_equivariant="not with criterion trace: the trace depends on the units of the axes",
     linear=True,
+    example=Example(({}, TRACE, GIVEN), not_equivariant=(TRACE,), idempotent=True),
 )

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 
 from track_fusion.densities.elliptical.spd_means import log_euclidean_mean
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.shared.elliptical import MhdpParams, fuse_projected
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.elliptical import HEAVY_TAILS, MhdpParams, fuse_projected
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,4 +60,5 @@ RULE = Rule(
     source="Chen 2022 (39)-(40), (45), (48), (64)",
     cost="K n^3, about twenty times",
     affine_equivariant=False,
+    example=Example(({}, {"criterion": "unsquared"}, HEAVY_TAILS), idempotent=True),
 )

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from track_fusion.densities.elliptical.spd_means import karcher_mean
 from track_fusion.linalg import Array
 from track_fusion.params import param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.shared.elliptical import MhdpParams, fuse_projected
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.elliptical import HEAVY_TAILS, MhdpParams, fuse_projected
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,4 +73,5 @@ RULE = Rule(
     caveat="weights follow the means: a rare large error that most tracks share exceeds what is claimed by 36 %",
     source="Chen 2022 (39)-(40), (45), (48), (58)",
     cost="K n^3, about forty times",
+    example=Example(({}, {"criterion": "unsquared"}, {"scatter": "intersection"}, HEAVY_TAILS), idempotent=True),
 )

@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 
 from track_fusion.densities.mixture.algebra import average
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
 from track_fusion.rules.shared.mixtures import AverageParams, fused_tracks
+from track_fusion.rules.shared.weights import GIVEN
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,4 +54,5 @@ RULE = Rule(
     caveat="of the merged moments, if every track is; not with reduction cap",
     source="Li 2019 (9)",
     cost="K C n^2 for C components a source, (K C)^2 n^3 to merge them",
+    example=Example(({}, GIVEN, {"max_components": 3}), ({}, GIVEN), idempotent=True),
 )

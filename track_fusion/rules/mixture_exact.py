@@ -30,7 +30,7 @@ from track_fusion.densities.mixture.quotient import (
 from track_fusion.densities.mixture.sampling import Weighted, weighted_em
 from track_fusion.linalg import Array, asymmetric, is_positive_definite
 from track_fusion.params import param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
 from track_fusion.rules.shared.folding import Step, fold_mixtures
 from track_fusion.rules.shared.quotients import (
     QuotientParams,
@@ -289,4 +289,5 @@ RULE = Rule(
     order_matters=True,
     needs=("common",),
     optional=("seed",),
+    example=Example(({"mixand_samples": 400}, {"method": "igs", "samples": 2000}), idempotent=False, monte_carlo=0.3),
 )

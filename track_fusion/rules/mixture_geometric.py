@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
 from track_fusion.rules.shared.mixtures import AverageParams, fused_tracks, geometric_average
+from track_fusion.rules.shared.weights import GIVEN
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,4 +56,5 @@ RULE = Rule(
     caveat="one component: covariance intersection; for several the power is an approximation",
     source="Li 2019 (49)-(51)",
     cost="C^K n^3 for C components a source",
+    example=Example(({}, GIVEN), idempotent=False),
 )

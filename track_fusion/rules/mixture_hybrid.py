@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 
-from track_fusion.rules.base import FusedTracks, Mixture, Rule, SourceTracks
+from track_fusion.rules.base import Example, FusedTracks, Mixture, Rule, SourceTracks
 from track_fusion.rules.shared.mixtures import (
     AverageParams,
     fused_tracks,
     geometric_average,
     source_mixtures,
 )
+from track_fusion.rules.shared.weights import GIVEN
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,4 +60,5 @@ RULE = Rule(
     caveat="one component: covariance intersection; keeps the mean number of targets, not every target",
     source="Li 2019 section 5.2, (49)-(51)",
     cost="C^K n^3 for C components a source",
+    example=Example(({}, GIVEN), idempotent=False),
 )

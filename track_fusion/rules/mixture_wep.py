@@ -25,7 +25,7 @@ from track_fusion.densities.mixture.sampling import (
 from track_fusion.linalg import Array
 from track_fusion.params import param
 from track_fusion.rules import covariance_intersection
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
 from track_fusion.rules.geometric_average import GeometricAverageParams
 from track_fusion.rules.geometric_average import fuse as geometric_average
 from track_fusion.rules.shared.folding import Step, fold_mixtures, share_of_first
@@ -39,7 +39,7 @@ from track_fusion.rules.shared.quotients import (
     sample_mixands,
 )
 from track_fusion.rules.shared.sampling import Generators, fuse_sampled
-from track_fusion.rules.shared.weights import WeightParams
+from track_fusion.rules.shared.weights import GIVEN, WeightParams
 
 
 @dataclasses.dataclass(frozen=True)
@@ -219,6 +219,14 @@ def _pairs(first: tuple[Array, int], second: tuple[Array, int]) -> Array:
 METHODS: dict[str, Method] = {"dls": _dls, "igs": _igs, "is_wem": _em, "foci": _foci, "pcci": _pcci}
 
 
+EXAMPLES = (
+    {"mixand_samples": 400, "samples": 4000},
+    {"method": "igs", "samples": 4000},
+    {"mixand_samples": 400, **GIVEN},
+    {"method": "foci", "criterion": "minimax_information_loss", "samples": 4000},
+    {"method": "pcci"},
+)
+
 RULE = Rule(
     key="mixture_wep",
     title="Weighted exponential product of mixtures",
@@ -232,4 +240,5 @@ RULE = Rule(
     cost="K C^2 S n^2 for C components a source and S samples a mixand",
     order_matters=True,
     optional=("seed",),
+    example=Example(EXAMPLES, idempotent=True, monte_carlo=0.3),
 )

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from track_fusion.params import Params
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
 from track_fusion.rules.shared.weights import pooled
 
 
@@ -54,4 +54,5 @@ RULE = Rule(
     source="Li 2022 (14)",
     cost="K n^3",
     linear=True,
+    example=Example(idempotent=False),
 )

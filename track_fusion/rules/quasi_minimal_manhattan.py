@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from track_fusion.densities.elliptical.rao import manhattan_paths
 from track_fusion.linalg import Array, inverse, matvec, symmetrise, transpose
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.shared.elliptical import EllipticalParams, each, family_of
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.elliptical import HEAVY_TAILS, EllipticalParams, each, family_of
 from track_fusion.rules.shared.weights import pooled_by
 from track_fusion.solvers.least_squares import minimise_squares_on_simplex
 from track_fusion.solvers.optimise import Solution
@@ -163,4 +163,5 @@ RULE = Rule(
     caveat="weights follow the means: a rare large error that most tracks share exceeds what is claimed by 26 %",
     source="Chen 2022 (27)-(28), (45), section 5",
     cost="K^3 n^3, about twenty times",
+    example=Example(({}, HEAVY_TAILS), idempotent=True),
 )

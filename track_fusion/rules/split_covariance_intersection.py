@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from track_fusion.linalg import Array, inverse, matvec, symmetrise, transpose
 from track_fusion.params import param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.shared.weights import WeightParams, diagnostics
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks, Values
+from track_fusion.rules.shared.weights import GIVEN, TRACE, UNIFORM, WeightParams, diagnostics
 from track_fusion.solvers.optimise import GradientHessian, minimise_on_simplex
 
 #: An independent part may leave the range from nothing to the covariance by this share of that: rounding.
@@ -177,6 +177,8 @@ def _gradient_hessian(parts: _Parts, criterion: str) -> GradientHessian:
     return gradient_hessian
 
 
+EXAMPLES: tuple[Values, ...] = ({}, TRACE, UNIFORM, GIVEN)
+
 RULE = Rule(
     key="split_covariance_intersection",
     title="Split covariance intersection",
@@ -190,4 +192,5 @@ RULE = Rule(
     cost="K n^3, about ten times that for weights that are sought",
     needs=("independent_cov",),
     affine_equivariant="not with criterion trace: the trace depends on the units of the axes",
+    example=Example(EXAMPLES, EXAMPLES, (TRACE,), idempotent=False),
 )

@@ -13,11 +13,14 @@ from track_fusion.densities.elliptical.projection import nearest_mean
 from track_fusion.densities.gaussian import weighted_product
 from track_fusion.linalg import Array
 from track_fusion.params import Params, param
-from track_fusion.rules.base import FusedTracks, SourceTracks
+from track_fusion.rules.base import FusedTracks, SourceTracks, Values
 from track_fusion.rules.shared.weights import diagnostics
 
 #: Covariances (B, K, n, n) of the tracks as projected to one mean, (33)-(34) -> fused (B, n, n), converged (B,).
 Scatter = Callable[[Array], tuple[Array, NDArray[np.bool_]]]
+
+#: Parameters of examples.
+HEAVY_TAILS: Values = {"family": "generalized_gaussian", "beta": 0.7}
 
 FAMILIES = ("student_t", "generalized_gaussian", "gaussian")
 

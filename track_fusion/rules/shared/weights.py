@@ -12,9 +12,14 @@ from track_fusion.densities.elliptical.projection import ProjectionMean
 from track_fusion.densities.gaussian import weighted_product
 from track_fusion.linalg import Array
 from track_fusion.params import Params, param
-from track_fusion.rules.base import FusedTracks, SourceTracks
+from track_fusion.rules.base import EACH, FusedTracks, SourceTracks, Values
 from track_fusion.solvers.optimise import Solution
 from track_fusion.solvers.upper_bound import Bound
+
+#: Parameters of examples.
+GIVEN: Values = {"criterion": "given", "weights": EACH}
+TRACE: Values = {"criterion": "trace"}
+UNIFORM: Values = {"criterion": "uniform"}
 
 
 @dataclasses.dataclass(frozen=True)
