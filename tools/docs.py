@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import textwrap
@@ -14,7 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from track_fusion.params import Params, specs
+from track_fusion.params import Params, Spec, specs
+from track_fusion.plugins import Registry
 
 if TYPE_CHECKING:
     from track_fusion.models.choices import Choice
@@ -253,12 +255,17 @@ def parameter_file(node: str, sections: Iterable[Section]) -> str:
         lines += ["", *_comment([f"--- {section.heading}"], "    ")]
         for name, (spec, default) in specs(section.params).items():
             unit = f" {spec.unit}" if spec.unit else ""
-            lines += _comment([f"{spec.doc} ({spec.wanted()}{',' + unit if unit else ''})"], "    ")
+            lines += _comment([f"{spec.doc} ({_ours(spec).wanted()}{',' + unit if unit else ''})"], "    ")
             # ROS has no list without entries: it stays unset.
             value = yaml_value(default) if default != () else "unset"
             mark = "" if section.declared and default != () else "# "
             lines.append(f"    {mark}{section.prefix}{name}: {value}")
     return "\n".join(lines) + "\n"
+
+
+def _ours(spec: Spec) -> Spec:
+    """Leave out of the choices what other packages on this machine bring."""
+    return dataclasses.replace(spec, choices=spec.choices.own) if isinstance(spec.choices, Registry) else spec
 
 
 def _comment(paragraphs: Iterable[str], indent: str) -> list[str]:
