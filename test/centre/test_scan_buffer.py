@@ -5,7 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from track_fusion.centre.scan_buffer import ScanBuffer, ScanBufferParams
+from track_fusion.centre import buffer as functions
+from track_fusion.centre.buffer import ScanBuffer
+from track_fusion.centre.config import CentreConfig, ScanBufferParams, SourceConfig
+from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
+from track_fusion.rules import RULES
 from track_fusion.tracks import TrackBatch, planar_layout
 
 MS = 10**6
@@ -19,8 +23,35 @@ def scan(*ids):
     )
 
 
+class Held:
+    """Holds a buffer, a value, from call to call."""
+
+    def __init__(self, assembles, params):
+        sources = tuple(SourceConfig(str(k), assembles=a) for k, a in enumerate(assembles))
+        motion, rule = NearlyConstantVelocity(LAYOUT, MotionParams()), RULES["naive"]
+        self.config = CentreConfig(sources, motion, "map", rule, rule.params(), buffer=params)
+        self.reset()
+
+    def reset(self):
+        self.value = ScanBuffer.empty(self.config)
+
+    def add(self, source, scan, stamp_ns, now_ns):
+        self.value, reason = functions.add(self.config, self.value, source, scan, stamp_ns, now_ns)
+        return reason
+
+    def pop(self, now_ns, living=False):
+        self.value, step = functions.advance(self.config, self.value, now_ns, living)
+        return step
+
+    def silent_since(self, source, now_ns):
+        return self.value.silence_s(source, now_ns)
+
+    def all_silent(self, now_ns):
+        return functions.all_silent(self.config, self.value, now_ns)
+
+
 def buffer(sources=2, assembles=(), **params):
-    return ScanBuffer([k in assembles for k in range(sources)], ScanBufferParams(**params))
+    return Held([k in assembles for k in range(sources)], ScanBufferParams(**params))
 
 
 def add(buf, source, stamp_ms, now_ms, *ids):
@@ -232,7 +263,7 @@ def arrivals(draw):
 def test_any_order_of_arrival_across_sources_gives_the_same_steps(arrived, assembling):
     """Every stamp is a step, at once or when the sources fall silent, and holds all scans of its time."""
     stamps, turns = arrived
-    buf = ScanBuffer([assembling] * len(stamps), ScanBufferParams(source_timeout_s=5.0, fusion_timeout_s=5.0))
+    buf = Held([assembling] * len(stamps), ScanBufferParams(source_timeout_s=5.0, fusion_timeout_s=5.0))
     queues, found = [list(s) for s in stamps], []
     for now, k in enumerate(turns):
         add(buf, k, queues[k].pop(0), 13 + now)
