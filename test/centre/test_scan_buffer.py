@@ -1,5 +1,7 @@
 """When a step runs and what belongs to it: every policy, every reason, any order of arrival."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -249,6 +251,50 @@ def test_forgets_everything_when_the_clock_jumps_back():
     assert steps(buf, 100) == []
     assert add(buf, 1, 200, 200, 1) is None
     assert steps(buf, 200)[0] == (100, {0: [100], 1: [1]})
+
+
+def test_when_all_are_silent_a_step_without_scans_runs_while_tracks_live():
+    buf = buffer(source_timeout_s=1.0)
+    assert buf.pop(10_000 * MS, living=True) is None  # nothing was ever heard
+    add(buf, 0, 5000, 5000)
+    add(buf, 1, 5000, 5000)
+    assert steps(buf, 5000) == [(5000, {0: [5000], 1: [15_000]})]
+    for now, living, time in [(5999, True, None), (6000, False, None), (6010, True, 6010), (7009, True, None),
+                              (7010, True, 7010)]:  # fmt: skip
+        step = buf.pop(now * MS, living)
+        assert step == (None if time is None else (time * MS, {}, {}))
+    add(buf, 1, 7500, 7500)
+    assert times(buf, 7600) == [7500]
+    assert buf.pop(8499 * MS, living=True) is None
+    assert buf.pop(8500 * MS, living=True) == (8500 * MS, {}, {})
+
+
+@pytest.mark.parametrize("assembling", [False, True])
+def test_no_function_changes_the_buffer_it_is_given(assembling):
+    """Whatever was done with a buffer since, doing the same to it again gives the same."""
+    buf, kept = buffer(2, assembles=(1,) if assembling else (), source_timeout_s=0.3, fusion_timeout_s=0.05), []
+
+    def told(value):
+        return (
+            value.fused_ns,
+            [(q.newest_ns, q.heard_ns, [(*w[:2], w.scan.track_id.tolist()) for w in q.waiting]) for q in value.queues],
+        )
+
+    for now, what in [(100, (0, 100, 7)), (100, (1, 100, 5)), (101, (1, 100, 6)), (102, (0, 100, 7)), (103, None),
+                      (120, (1, 110, 5)), (130, (0, 110, 7)), (150, None), (200, None), (600, None)]:  # fmt: skip
+        before = buf.value
+        if what is None:
+            action = partial(functions.advance, buf.config, before, now * MS, True)
+        else:
+            source, stamp, track_id = what
+            action = partial(functions.add, buf.config, before, source, scan(track_id), stamp * MS, now * MS)
+        buf.value, outcome = action()
+        kept.append((before, told(before), action, told(buf.value), repr(outcome)))
+    assert sum("scans={}" in outcome for *_, outcome in kept) == 1
+    for before, content, action, after, outcome in kept:
+        assert told(before) == content
+        value, again = action()
+        assert (told(value), repr(again)) == (after, outcome)
 
 
 @st.composite

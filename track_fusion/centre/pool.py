@@ -175,11 +175,10 @@ def predicted_to(batch: TrackBatch, time_ns: int, motion: Motion) -> TrackBatch:
     ------
     ValueError    a track is later than `time_ns`
     """
-    stamps = np.unique(batch.time_ns)
-    if not len(batch) or (len(stamps) == 1 and stamps[0] == time_ns):
+    if (batch.time_ns == time_ns).all():
         return batch
     mean, cov = np.empty_like(batch.mean), np.empty_like(batch.cov)
-    for stamp in stamps:
+    for stamp in np.unique(batch.time_ns):
         at = batch.time_ns == stamp
         mean[at], cov[at] = predict(batch.mean[at], batch.cov[at], motion.over((time_ns - int(stamp)) / SECOND_NS))
     return batch.replace(mean=mean, cov=cov, time_ns=np.full(len(batch), time_ns))
