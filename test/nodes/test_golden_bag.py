@@ -1,4 +1,4 @@
-"""The golden bags through real nodes against oracles that share no code with the package (test/data/make_golden*.py).
+"""The golden bags through real nodes against oracles that share no code with the package (test/oracles/).
 
 One replay process plays the bag of track tables to three centres, one a rule; another one that of Odometry, on a clock
 of its own. What is published is recorded in both storage formats, and both recordings are played again.
