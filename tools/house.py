@@ -36,7 +36,7 @@ FLOORS: tuple[Mapping[str, str], ...] = (
     {"metrics": "accuracy, consistency, evaluation, significance"},
     {"association": "gate, cost, assignment"},
     {"solvers": "numerics that know nothing of tracks"},
-    {"ground": "data model, parameters, linear algebra, angles, random streams"},
+    {"ground": "modules outside any folder: data model, parameters, linear algebra, angles, random streams"},
 )
 #: The modules that stand on the ground, outside any folder, and the package itself.
 GROUND = frozenset({"", "angles", "linalg", "params", "plugins", "random_streams", "tracks"})

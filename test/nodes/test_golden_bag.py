@@ -151,10 +151,10 @@ def test_identities_do_not_switch(fused: Any) -> None:
 
 #: Bag of detections, the scenario whose parameter file runs it, rule.
 SCENARIOS = [
-    ("turn", "li2022-nonlinear", "arithmetic_average"),
+    pytest.param("turn", "li2022-nonlinear", "arithmetic_average", marks=pytest.mark.slow),
     ("turn", "li2022-nonlinear", "covariance_intersection"),
     ("line", "li2022-linear", "arithmetic_average"),
-    ("line", "li2022-linear", "naive"),
+    pytest.param("line", "li2022-linear", "naive", marks=pytest.mark.slow),
 ]
 
 
