@@ -131,7 +131,6 @@ def install(folder, extras, pins, sourced):
     extras = extras + ([] if sourced else ["ros"])
     project = ROOT + ("[%s]" % ",".join(extras) if extras else "")
     pip = [os.path.join(folder, "bin", "python"), "-m", "pip", "install", "-qq", "--disable-pip-version-check"]
-    pip += ["--no-compile"]  # a third of the time, for modules most of which are never loaded
     if subprocess.call(pip + ["-e", project] + pins, env=clean_environment()) != 0:
         raise Refusal("pip could not install the project into %s (the lines above say why)." % folder)
 
