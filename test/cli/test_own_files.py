@@ -153,6 +153,7 @@ def test_parameters_are_given_by_rule(examples: Path) -> None:
     assert means[0] != means[1]
 
 
+@pytest.mark.slow
 def test_the_figures_depend_on_the_seed_alone(examples: Path) -> None:
     words = (str(examples / "two_thermometers.py"), "--rules", "naive", "--runs", "1100")
     assert compared(*words, "--jobs", "1") == compared(*words, "--jobs", "3")
