@@ -9,8 +9,8 @@ import pytest
 from cli.runner import refusal, run
 
 from track_fusion.demo import demo as demonstration
-from track_fusion.demo.bringup import bringups
 from track_fusion.demo.demo import demo_of
+from track_fusion.demo.wiring import bringups
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.scenarios import SCENARIOS
 

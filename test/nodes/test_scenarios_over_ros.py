@@ -20,7 +20,8 @@ from ros_helpers import Probe
 from sensor_msgs.msg import PointCloud2
 
 from msg_adapters.arrays import merged
-from track_fusion.demo.bringup import Bringup, bringups, local_environment, running, start_scenario
+from track_fusion.demo.bringup import local_environment, running, start_scenario
+from track_fusion.demo.wiring import Bringup, bringups
 from track_fusion.filters import extended
 from track_fusion.rules import RULES, get_rule
 from track_fusion.scenarios import RuleChoice, get_scenario
@@ -110,7 +111,7 @@ def run(case: Case, context: Any, domain: int, folder: Path) -> tuple[list[Point
     """Run all steps of a scenario; return the fused tables and what the evaluator says."""
     log, judged = folder / "nodes.log", folder / "judged.json"
     bringup, fused = Bringup(case.name), "/fusion_centre/tracks" if case.rule else "/sensor_1/tracks"
-    trackers = bringup.trackers_of(case.rule)
+    trackers = bringup.trackers if case.rule else bringup.trackers[:1]
     patient = {"subscribers_deadline_s": START_S}
     overrides: dict[str, dict[str, Any]] = {name: {**patient, "feedback_timeout_s": RUN_S} for name in trackers}
     overrides["fusion_centre"] = {**patient, **case.parameters}

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from package import launch_stand_in
 
-from track_fusion.demo.bringup import Bringup, bringups
+from track_fusion.demo.wiring import Bringup, bringups
 from track_fusion.scenarios import get_scenario
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -15,7 +15,7 @@ def scenarios(as_json: bool) -> None:
     Example: track-fusion scenarios --json
     """
     from track_fusion.cli.output import console, grid, print_json
-    from track_fusion.demo.bringup import demos_of
+    from track_fusion.demo.wiring import demos_of
     from track_fusion.scenarios import SCENARIOS
 
     names = ("key", "title", "paper", "shows", "default_runs", "published_runs", "assumptions")

@@ -25,7 +25,8 @@ from sensor_msgs.msg import PointCloud2
 from msg_adapters.arrays import merged
 from msg_adapters.odometry import odometry_from_msg
 from msg_adapters.track_table import track_table_from_msg
-from track_fusion.demo.bringup import Bringup, Nodes, bringups, local_environment, running, start_scenario
+from track_fusion.demo.bringup import Nodes, local_environment, running, start_scenario
+from track_fusion.demo.wiring import FUSED, TRUTH, Bringup, bringups
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.nodes.managed import Fault, qos
 from track_fusion.nodes.recorder import Recorder, read_bag
@@ -56,8 +57,6 @@ FAST_RUNS = 1000
 DOMAINS = 101
 #: What a demonstration writes; only a folder with nothing else is cleared.
 RESULTS = ("bag", "figures.json", "tracks.png", "nodes_*.log", "evaluation_*.json")
-TRUTH = "/replay/truth"
-FUSED = "/fusion_centre/tracks"
 TABLE, ODOMETRY = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry"
 #: Of the sensors, and last of what is fused.
 COLORS = ("tab:blue", "tab:orange", "tab:green", "tab:purple", "tab:red")
