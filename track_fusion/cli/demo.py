@@ -52,7 +52,6 @@ def demo(name: str, rules: str | None, seed: int, runs: int | None, out: Path) -
       track-fusion demo li2022-nonlinear-sir
     """  # noqa: D301  click reads \b as "do not wrap"
     from track_fusion.demo.demo import demo_of, run_demo
-    from track_fusion.nodes.managed import Fault
 
     chosen = tuple(r.strip() for r in rules.split(",")) if rules else ()
     began = time.monotonic()
@@ -63,19 +62,16 @@ def demo(name: str, rules: str | None, seed: int, runs: int | None, out: Path) -
         TextColumn("{task.percentage:3.0f} %"),
         TimeElapsedColumn(),
     )
-    try:
-        planned = demo_of(name, out, seed, runs, chosen)
-        with Progress(*columns, console=console) as bar:
-            tasks: dict[str, Any] = {}
+    planned = demo_of(name, out, seed, runs, chosen)
+    with Progress(*columns, console=console) as bar:
+        tasks: dict[str, Any] = {}
 
-            def progress(what: str, share: float) -> None:
-                if what not in tasks:
-                    tasks[what] = bar.add_task(what, total=1.0)
-                bar.update(tasks[what], completed=share)
+        def progress(what: str, share: float) -> None:
+            if what not in tasks:
+                tasks[what] = bar.add_task(what, total=1.0)
+            bar.update(tasks[what], completed=share)
 
-            result = run_demo(planned, progress)
-    except Fault as error:
-        raise click.ClickException(str(error)) from None
+        result = run_demo(planned, progress)
     for table in _tables(result, planned.row, planned.rules, planned.library_runs):
         console.print(table)
     console.print(

@@ -25,12 +25,13 @@ from sensor_msgs.msg import PointCloud2
 from msg_adapters.arrays import merged
 from msg_adapters.odometry import odometry_from_msg
 from msg_adapters.track_table import track_table_from_msg
+from track_fusion.bags.read import read_bag
 from track_fusion.demo.bringup import Nodes, local_environment, running, start_scenario
 from track_fusion.demo.wiring import FUSED, TRUTH, Bringup, bringups
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.nodes.managed import Fault, qos
-from track_fusion.nodes.recorder import Recorder, read_bag
-from track_fusion.params import ParameterError, specs, unknown_name_error
+from track_fusion.nodes.managed import qos
+from track_fusion.nodes.recorder import Recorder
+from track_fusion.params import Fault, ParameterError, specs, unknown_name_error
 from track_fusion.report.picture import Line, draw, draw_map
 from track_fusion.rules import get_rule
 from track_fusion.scenarios import SCENARIOS, RuleChoice, Scenario, get_scenario, judged_figures

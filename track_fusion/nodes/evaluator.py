@@ -14,7 +14,8 @@ from msg_adapters.header import stamp_to_ns
 from msg_adapters.odometry import odometry_from_msg
 from msg_adapters.track_table import track_table_from_msg
 from track_fusion.metrics.evaluation import Evaluation, EvaluationParams
-from track_fusion.nodes.managed import ManagedNode, end, run
+from track_fusion.nodes.managed import ManagedNode
+from track_fusion.nodes.process import end, run
 from track_fusion.nodes.ros_params import declare
 from track_fusion.nodes.screening import FrameParams, screened_tracks
 from track_fusion.params import Params, param

@@ -21,7 +21,8 @@ from track_fusion.centre.centre import FusionCentre, FusionCentreParams, StepInf
 from track_fusion.centre.scan_buffer import ScanBuffer, ScanBufferParams
 from track_fusion.centre.track_manager import TrackManagerParams
 from track_fusion.models.choices import MOTIONS, MotionChoice
-from track_fusion.nodes.managed import ManagedNode, end, run
+from track_fusion.nodes.managed import ManagedNode
+from track_fusion.nodes.process import end, run
 from track_fusion.nodes.ros_params import chosen, declare
 from track_fusion.nodes.screening import FrameParams, screened_tracks
 from track_fusion.params import ParameterError, Params, param
