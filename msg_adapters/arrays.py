@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,6 +109,11 @@ class TrackArrays:
     dof: Floats
     uuid: NDArray[np.uint8] | None = None
     phd: bool = False
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """All but the axes, by name: what a TrackBatch takes beside its layout."""
+        return {name: value for name, value in vars(self).items() if name != "axes"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -51,7 +51,8 @@ def demo(name: str, rules: str | None, seed: int, runs: int | None, out: Path) -
       track-fusion demo li2022-linear --rules naive,arithmetic_average
       track-fusion demo li2022-nonlinear-sir
     """  # noqa: D301  click reads \b as "do not wrap"
-    from track_fusion.demo.demo import demo_of, run_demo
+    from track_fusion.demo.demo import run_demo
+    from track_fusion.demo.plan import demo_of
 
     chosen = tuple(r.strip() for r in rules.split(",")) if rules else ()
     began = time.monotonic()
