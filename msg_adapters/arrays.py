@@ -116,6 +116,18 @@ class TrackArrays:
         return {name: value for name, value in vars(self).items() if name != "axes"}
 
 
+def one_track(
+    axes: tuple[str, ...], frame_id: str, mean: Floats, cov: Floats, *, time_ns: int, track_id: int, status: int
+) -> TrackArrays:
+    """Make the arrays of one certain Gaussian track from mean (n,) and cov (n, n)."""
+    return TrackArrays(
+        axes=axes, frame_id=frame_id, weight=np.ones((1, 1)), mean=mean[None, None], cov=cov[None, None],
+        time_ns=np.array([time_ns], np.int64), track_id=np.array([track_id], np.int64),
+        source=np.zeros(1, np.uint32), status=np.array([status], np.uint8),
+        existence=np.ones(1), dof=np.full(1, np.inf),
+    )  # fmt: skip
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class DetectionArrays:
     """N detections of one scan: value (N, m), cov (N, m, m) or None when the message carries none."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,6 +12,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from msg_adapters.arrays import Floats, TrackLike, merged
 from msg_adapters.header import NS_PER_S, make_header
+from msg_adapters.orientation import from_matrix
 
 _CONFIRMED, _COASTED = 1, 2
 #: Red, green, blue, opacity.
@@ -59,14 +59,14 @@ def markers_to_msg(
     drawn = np.flatnonzero(np.isfinite(mean).all(1) & np.isfinite(cov).all((1, 2)))
     position, spread = _picked(axes, ("x", "y", "z"), mean[drawn], cov[drawn])
     velocity, _ = _picked(axes, ("vx", "vy", "vz"), mean[drawn], cov[drawn])
-    scale, quaternion = _ellipsoids(spread, sigmas, flat="z" not in axes)
+    scale, orientation = _ellipsoids(spread, sigmas, flat="z" not in axes)
     moves = "vx" in axes and "vy" in axes
     life = Duration(sec=int(lifetime_s), nanosec=int(lifetime_s % 1 * NS_PER_S))
     for k, row in enumerate(drawn.tolist()):
         color = _color(int(tracks.status[row]))
         here = position[k].tolist()
         pen = _Pen(header, namespace, row, color, life)
-        out.append(pen.ellipsoid(here, scale[k].tolist(), quaternion[k], flat="z" not in axes))
+        out.append(pen.ellipsoid(here, scale[k].tolist(), orientation[k], flat="z" not in axes))
         if moves:
             out.append(pen.arrow(here, (position[k] + horizon_s * velocity[k]).tolist()))
         out.append(pen.text(here, str(tracks.track_id[row])))
@@ -91,9 +91,8 @@ class _Pen:
             color=ColorRGBA(r=r, g=g, b=b, a=1.0 if opaque else a),
         )  # fmt: skip
 
-    def ellipsoid(self, at: list[float], scale: list[float], quaternion: list[float], flat: bool) -> Marker:
-        x, y, z, w = quaternion
-        pose = Pose(position=_point(at), orientation=Quaternion(x=x, y=y, z=z, w=w))
+    def ellipsoid(self, at: list[float], scale: list[float], turned: Quaternion, flat: bool) -> Marker:
+        pose = Pose(position=_point(at), orientation=turned)
         return self._marker(Marker.CYLINDER if flat else Marker.SPHERE, "covariance", scale, pose, opaque=False)
 
     def arrow(self, start: list[float], tip: list[float]) -> Marker:
@@ -129,8 +128,8 @@ def _picked(axes: Sequence[str], wanted: tuple[str, str, str], mean: Floats, cov
     return out_mean, out_cov
 
 
-def _ellipsoids(cov: Floats, sigmas: float, flat: bool) -> tuple[Floats, list[list[float]]]:
-    """Return full lengths of the axes (N, 3), m, and orientations (x, y, z, w) of covariances (N, 3, 3)."""
+def _ellipsoids(cov: Floats, sigmas: float, flat: bool) -> tuple[Floats, list[Quaternion]]:
+    """Return full lengths of the axes (N, 3), m, and orientations of covariances (N, 3, 3)."""
     size = 2 if flat else 3
     values, vectors = np.linalg.eigh(cov[:, :size, :size])
     scale = np.full((len(cov), 3), _THIN_M)
@@ -139,19 +138,4 @@ def _ellipsoids(cov: Floats, sigmas: float, flat: bool) -> tuple[Floats, list[li
     turn[:, 2, 2] = 1.0
     turn[:, :size, :size] = vectors
     turn[:, :, 0] *= np.sign(np.linalg.det(turn))[:, None]  # eigenvectors may be a reflection
-    return scale, [_quaternion(r) for r in turn.tolist()]
-
-
-def _quaternion(r: list[list[float]]) -> list[float]:
-    """Return (x, y, z, w) of a rotation matrix, by its largest component, which no cancellation spoils."""
-    trace = r[0][0] + r[1][1] + r[2][2]
-    squared = [1 + 2 * r[0][0] - trace, 1 + 2 * r[1][1] - trace, 1 + 2 * r[2][2] - trace, 1 + trace]
-    big = max(range(4), key=squared.__getitem__)
-    s = math.sqrt(squared[big]) * 2
-    if big == 3:
-        return [(r[2][1] - r[1][2]) / s, (r[0][2] - r[2][0]) / s, (r[1][0] - r[0][1]) / s, s / 4]
-    i, j, k = big, (big + 1) % 3, (big + 2) % 3
-    out = [0.0] * 4
-    out[i], out[3] = s / 4, (r[k][j] - r[j][k]) / s
-    out[j], out[k] = (r[j][i] + r[i][j]) / s, (r[k][i] + r[i][k]) / s
-    return out
+    return scale, [from_matrix(r) for r in turn.tolist()]

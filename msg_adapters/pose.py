@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
-from msg_adapters.arrays import MessageError, TrackArrays
+from msg_adapters.arrays import MessageError, TrackArrays, one_track
 from msg_adapters.header import stamp_to_ns
-from msg_adapters.odometry import one_track
 
 _SLOT = {"x": 0, "y": 1, "z": 2}
 
