@@ -150,11 +150,11 @@ def test_the_nodes_give_the_numbers_of_the_library(
     assert [stamp_ns(m) for m in messages] == [k * step_ns for k in range(1, tracking.steps + 1)]
     truth, sample = drawn(tracking, [RUN], SEED)
     expected = np.array([fused.mean[0] for fused in case.library.estimates(sample)])
-    found = np.array([merged(read(m), axes)[0][0] for m in messages])
+    estimated = np.array([merged(read(m), axes)[0][0] for m in messages])
     scale = np.abs(expected).max(0)
-    np.testing.assert_allclose(found / scale, expected / scale, rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(estimated / scale, expected / scale, rtol=0, atol=TOLERANCE)
     assert (judged["times"], judged["missed"], judged["false"]) == (tracking.steps, 0, 0)
-    compare_figures(case, judged["all"], found - truth[0, 1:])
+    compare_figures(case, judged["all"], estimated - truth[0, 1:])
 
 
 def compare_figures(case: Case, judged: dict[str, Any], error: NDArray[np.float64]) -> None:
@@ -190,13 +190,13 @@ def test_radars_in_clutter_give_the_tracks_of_the_library(ros_context: Any, ros_
     ]
     assert len(expected[-1][0]) > 10
     for msg, (tracks, _) in zip(messages, expected, strict=True):
-        found = read(msg)
+        table = read(msg)
         for field in ("track_id", "source", "status"):
-            np.testing.assert_array_equal(getattr(found, field), getattr(tracks, field))
+            np.testing.assert_array_equal(getattr(table, field), getattr(tracks, field))
         for field in ("mean", "cov", "existence"):
             want = getattr(tracks, field)
             np.testing.assert_allclose(
-                getattr(found, field), want, rtol=0, atol=TOLERANCE * np.abs(want).max(initial=1.0)
+                getattr(table, field), want, rtol=0, atol=TOLERANCE * np.abs(want).max(initial=1.0)
             )
     truth = sharma_radar_runs.scene().truth(SEED, RUN)[:: sharma_radar_runs.FUSION_SCANS][1 : len(messages) + 1]
     of_step = [sharma_radar_runs.judged(tracks, states) for (tracks, _), states in zip(expected, truth, strict=True)]

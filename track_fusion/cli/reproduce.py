@@ -79,14 +79,14 @@ def reproduce(
 
     chosen = tuple(SCENARIOS) if every else tuple(dict.fromkeys(names))
     works = [Work(name, find_scenario, wanted(find_scenario(name)), seed, only) for name in chosen]
-    found = []
+    judged = []
     for study in studies(works, jobs or os.cpu_count() or 1, out / "pieces"):
-        found.append((study, _result(study)))
+        judged.append((study, _result(study)))
         if not as_json:
-            _print_tables(find_scenario(study.work.scenario), found[-1][1], study.took_s)
-    _write(out, found)
+            _print_tables(find_scenario(study.work.scenario), judged[-1][1], study.took_s)
+    _write(out, judged)
     if as_json:
-        results = [result for _, result in found]
+        results = [result for _, result in judged]
         print_json(results[0] if len(results) == 1 else results)
     else:
         click.echo(f"Written: {out / 'report.html'}, {out / 'results.json'}")
@@ -107,7 +107,7 @@ def _result(study: Study) -> dict[str, Any]:
     }
 
 
-def _write(out: Path, found: list[tuple[Study, dict[str, Any]]]) -> None:
+def _write(out: Path, judged: list[tuple[Study, dict[str, Any]]]) -> None:
     """Write results.json, which is the same whenever the figures are, and report.html."""
     import numpy as np
 
@@ -117,7 +117,7 @@ def _write(out: Path, found: list[tuple[Study, dict[str, Any]]]) -> None:
     from track_fusion.scenarios import find_scenario
 
     sections = []
-    for study, result in found:
+    for study, result in judged:
         scenario = find_scenario(study.work.scenario)
         sections.append(Section(result, scenario, scenario.charts(study.samples), study.took_s))
     content = [{**plain(s.result), "charts": plain(s.charts)} for s in sections]
@@ -164,10 +164,10 @@ def _table(quantity: str, figures: Sequence[Mapping[str, Any]]) -> Table:
     from track_fusion.report.page import measured_text, published_text, quantity_text
 
     title = f"{quantity_text(quantity)}, ± standard error"
-    found = table("filter and rule", "measured", "published", "verdict", title=title)
-    found.columns[1].justify = found.columns[2].justify = "right"
+    compared = table("filter and rule", "measured", "published", "verdict", title=title)
+    compared.columns[1].justify = compared.columns[2].justify = "right"
     for f in figures:
         verdict = f"[{STYLES[f['verdict']]}]{f['verdict']}[/]"
         measured = measured_text(f["value"], f["standard_error"])
-        found.add_row(escape(f["name"].rpartition("/")[0]), measured, published_text(f["published"]), verdict)
-    return found
+        compared.add_row(escape(f["name"].rpartition("/")[0]), measured, published_text(f["published"]), verdict)
+    return compared

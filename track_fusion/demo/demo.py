@@ -7,9 +7,9 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from track_fusion.demo.drawing import picture
 from track_fusion.demo.figures import figures, library
 from track_fusion.demo.over_ros import Progress, over_ros
+from track_fusion.demo.picture import picture
 from track_fusion.demo.plan import Demo
 from track_fusion.params import Fault
 

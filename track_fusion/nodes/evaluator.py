@@ -84,9 +84,9 @@ class EvaluatorNode(ManagedNode):
 
     def diagnose(self) -> tuple[list[str], dict[str, Any]]:
         """Report the consistency so far."""
-        found = self.evaluation.consistency()
+        consistency = self.evaluation.consistency()
         overconfident = self.evaluation.is_overconfident()
-        values = {"times": self.evaluation.times, "anees": found.anees, "anees_high": found.high}
+        values = {"times": self.evaluation.times, "anees": consistency.anees, "anees_high": consistency.high}
         return (["overconfident"] if overconfident else []), values
 
 
