@@ -64,22 +64,27 @@ def _run(demo: Demo, rule: str | None, judged: Path, log: Path, progress: Callab
     """Run to the end, recording the last rule; return the fused tracks where the scenario judges them itself."""
     domain = (os.getpid() + len(rule or "alone")) % DOMAINS
     topics = _recorded(demo) if rule == demo.rules[-1] else {}
+    ticks: list[Any] = []
+    tables: list[Any] = []
     with running(local_environment(domain), log) as nodes, _observer(domain) as (node, spin):
         recorder = Recorder(node, demo.out / "bag", topics) if topics else None
-        seen, fused = _clock_counter(node), _listener(node) if demo.many_targets else []
+        node.create_subscription(ClockMessage, "/clock", ticks.append, qos(1000))
+        if demo.many_targets:
+            node.create_subscription(PointCloud2, FUSED, tables.append, qos(1000))
         key = rule and rule.partition("@")[0]
         start_scenario(nodes, demo.name, key, _overrides(demo, rule, judged, topics))
-        _wait(nodes, log, spin, lambda: progress(seen() / demo.scene.steps))
+        _wait(nodes, log, spin, lambda: progress(len(ticks) / demo.scene.steps))
         deadline = time.monotonic() + LAST_MESSAGES_S
         while time.monotonic() < deadline and (
-            (demo.many_targets and len(fused) < demo.results)
+            (demo.many_targets and len(tables) < demo.results)
             or (recorder is not None and min(recorder.counts[t] for t in topics) < demo.results)
         ):
             spin()
         if recorder is not None:
             recorder.close()
     progress(1.0)
-    return fused
+    scans = map(track_table_from_msg, tables)
+    return [TrackBatch(layout=StateLayout(scan.axes), **scan.columns) for scan in scans]
 
 
 def _recorded(demo: Demo) -> dict[str, str]:
@@ -133,29 +138,6 @@ def _observer(domain: int) -> Iterator[tuple[Node, Callable[[], None]]]:
     finally:
         executor.shutdown()
         context.try_shutdown()
-
-
-def _clock_counter(node: Node) -> Callable[[], int]:
-    count = 0
-
-    def on_clock(msg: Any) -> None:
-        nonlocal count
-        count += 1
-
-    node.create_subscription(ClockMessage, "/clock", on_clock, qos(1000))
-    return lambda: count
-
-
-def _listener(node: Node) -> list[TrackBatch]:
-    """Return the list that grows by each batch of fused tracks."""
-    batches: list[TrackBatch] = []
-
-    def on_tracks(msg: Any) -> None:
-        arrays = track_table_from_msg(msg)
-        batches.append(TrackBatch(layout=StateLayout(arrays.axes), **arrays.columns))
-
-    node.create_subscription(PointCloud2, FUSED, on_tracks, qos(1000))
-    return batches
 
 
 def _wait(nodes: Nodes, log: Path, spin: Callable[[], None], report: Callable[[], None]) -> None:

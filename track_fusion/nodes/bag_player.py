@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from track_fusion.bags.read import open_bag
-from track_fusion.nodes.managed import ManagedNode, qos
-from track_fusion.nodes.message_class import message_class
+from track_fusion.nodes.managed import ManagedNode, message_class, qos
 from track_fusion.params import Fault, ParameterError, Params, param
 from track_fusion.tracks import SECOND_NS
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import time
 import traceback
 from collections import Counter, deque
@@ -48,6 +49,23 @@ class ManagedParams(Params):
 def qos(depth: int) -> QoSProfile:
     """Reliable, keep the last `depth`: the default of every topic of this package."""
     return QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=depth)
+
+
+def message_class(name: str) -> Any:
+    """Return the class of a type such as sensor_msgs/msg/PointCloud2.
+
+    Raises
+    ------
+    Fault    its package is not installed
+    """
+    package, _, kind = name.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), kind)
+    except (ImportError, AttributeError):
+        raise Fault(
+            f"The type {name} cannot be had: its package {package} is not installed here. Leave its topics out "
+            "(of a bag: by bag_topics)."
+        ) from None
 
 
 class ManagedNode(LifecycleNode):
@@ -158,9 +176,8 @@ class ManagedNode(LifecycleNode):
                 self.log.error(str(error))
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
-            if not rclpy.utilities.ok():  # a signal has come meanwhile
-                return TransitionCallbackReturn.FAILURE
-            self.log.error(f"{error}\n{traceback.format_exc()}")
+            if rclpy.utilities.ok():  # else a signal has come meanwhile
+                self.log.error(f"{error}\n{traceback.format_exc()}")
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 

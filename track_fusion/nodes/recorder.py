@@ -14,8 +14,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from track_fusion.nodes.managed import qos
-from track_fusion.nodes.message_class import message_class
+from track_fusion.nodes.managed import message_class, qos
 from track_fusion.params import Fault
 
 #: A recorder that falls behind by more messages of one topic than this loses some, and counts them.
