@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -114,6 +114,20 @@ class TrackArrays:
     def columns(self) -> dict[str, Any]:
         """All but the axes, by name: what a TrackBatch takes beside its layout."""
         return {name: value for name, value in vars(self).items() if name != "axes"}
+
+
+def slots_of(axes: Sequence[str], slots: Mapping[str, int], message: str) -> NDArray[np.intp]:
+    """Return where a message has the axes.
+
+    Raises
+    ------
+    MessageError    `missing_axis`: it has no place for one, or there is none
+    """
+    missing = [a for a in axes if a not in slots]
+    if missing or not axes:
+        got = ", ".join(missing) or "none"
+        raise MessageError("missing_axis", f"The axes of {message} must be of {', '.join(slots)}. Got {got}.")
+    return np.array([slots[a] for a in axes])
 
 
 def one_track(

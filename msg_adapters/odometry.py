@@ -17,7 +17,7 @@ import numpy as np
 from geometry_msgs.msg import Point, Pose, PoseWithCovariance, Twist, TwistWithCovariance, Vector3
 from nav_msgs.msg import Odometry
 
-from msg_adapters.arrays import Floats, MessageError, TrackArrays, TrackLike, merged, one_track
+from msg_adapters.arrays import Floats, MessageError, TrackArrays, TrackLike, merged, one_track, slots_of
 from msg_adapters.header import make_header, stamp_to_ns
 from msg_adapters.orientation import from_yaw, rotation_matrix, unit_quaternion, yaw_of, yaw_rotations
 
@@ -139,16 +139,10 @@ def odometry_from_msg(
     claim.
     """
     _check_parameters(cross_block, cross_weight, twist_frame)
-    missing = [a for a in axes if a not in _SLOT]
-    if missing or not axes:
-        raise MessageError(
-            "missing_axis",
-            f"The axes of an Odometry message must be of {', '.join(_SLOT)}. Got {', '.join(missing) or 'none'}.",
-        )
+    slots = slots_of(axes, _SLOT, "an Odometry message")
     if not msg.child_frame_id:
         raise MessageError("missing_child_frame", "The child_frame_id must name the track. Got an empty one.")
     mean, cov = _state(msg, needs_orientation="yaw" in axes)
-    slots = np.array([_SLOT[a] for a in axes])
     in_twist = slots >= _TWIST.start
     if twist_frame == "child" and in_twist.any():
         mean, cov = _to_parent(msg, mean, cov)

@@ -11,7 +11,7 @@ import click
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from track_fusion.cli.output import console, table
+from track_fusion.cli import output
 
 QUANTITIES = {
     "position_armse_m": "position ARMSE / m",
@@ -56,7 +56,7 @@ def demo(name: str, rules: str | None, seed: int, runs: int | None, out: Path) -
     from track_fusion.demo.plan import demo_of
 
     chosen = tuple(r.strip() for r in rules.split(",")) if rules else ()
-    began, out_console = time.monotonic(), console()
+    began, out_console = time.monotonic(), output.console()
     columns = (TextColumn("{task.description:32}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
     planned = demo_of(name, out, seed, runs, chosen)
     with Progress(*columns, console=out_console) as bar:
@@ -81,7 +81,7 @@ def _tables(result: dict[str, Any], filter_row: str, rules: tuple[str, ...], run
     for quantity, title in QUANTITIES.items():
         rows = [_row(figures, filter_row, row, quantity, runs) for row in ("alone", *rules)]
         if any(rows):
-            of_quantity = table(
+            of_quantity = output.table(
                 "", "ROS", "library", f"{runs} runs", "paper", "verdict",
                 title=f"{title} (ROS and library: the same one run)",
             )  # fmt: skip

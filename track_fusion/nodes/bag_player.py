@@ -71,8 +71,8 @@ class BagPlayer:
         self.wanted = dict.fromkeys(self._outputs.values(), subscribers_each)
         self.since_s = time.monotonic()
 
-    def start(self, finish: Callable[[], None]) -> None:
-        """Begin to play; `finish` is called after the last message."""
+    def start(self, finish: Callable[[str], None]) -> None:
+        """Begin to play; after the last message `finish` is told how much that was."""
         self._finish = finish
         self._rewind()
         self._timer = self._node.every(CLOCK_PERIOD_S, self._advance)
@@ -80,10 +80,6 @@ class BagPlayer:
     def awaited(self) -> str:
         """Say that nothing is waited for."""
         return ""
-
-    def played(self) -> str:
-        """Say how much has been played."""
-        return f"{self._node.counted['messages']} messages"
 
     def _rewind(self) -> None:
         start = self._reader.start_time + round(self._params.start_offset_s * SECOND_NS)
@@ -108,7 +104,7 @@ class BagPlayer:
                 self._rewind()
             else:
                 self._timer.cancel()
-                self._finish()
+                self._finish(f"{self._node.counted['messages']} messages")
 
 
 def _split(remap: str) -> tuple[str, str]:

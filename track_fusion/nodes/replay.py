@@ -62,15 +62,14 @@ class ReplayNode(ManagedNode):
     def connect(self) -> None:
         """Create the topics."""
         self._clock_out = self.create_publisher(ClockMessage, "/clock", qos(10))
-        self._player = self._make_player()
-        self.every(LOOK_PERIOD_S, self._tick)
-
-    def _make_player(self) -> BagPlayer | ScenarioPlayer:
         params, each = self.params, self.params.expected_subscribers_each
+        self._player: BagPlayer | ScenarioPlayer
         if params.bag:
-            return BagPlayer(self, self._tell_time, params.bag, self.bag, params.rate, each)
-        rate = params.rate if params.pace == "realtime" else None
-        return ScenarioPlayer(self, self._tell_time, self.scenario, rate, each)
+            self._player = BagPlayer(self, self._tell_time, params.bag, self.bag, params.rate, each)
+        else:
+            rate = params.rate if params.pace == "realtime" else None
+            self._player = ScenarioPlayer(self, self._tell_time, self.scenario, rate, each)
+        self.every(LOOK_PERIOD_S, self._tick)
 
     def _tell_time(self, now_ns: int) -> None:
         self._clock_out.publish(ClockMessage(clock=stamp_from_ns(now_ns)))
@@ -106,8 +105,8 @@ class ReplayNode(ManagedNode):
             missing.append(f"{results.topic_name} has no publisher")
         return missing
 
-    def _finish(self) -> None:
-        self.log.info(f"Replayed {self._player.played()} in {time.monotonic() - self._began_s:.2f} s.")
+    def _finish(self, what: str) -> None:
+        self.log.info(f"Replayed {what} in {time.monotonic() - self._began_s:.2f} s.")
         self.finished = True
 
     def close(self) -> None:

@@ -93,8 +93,8 @@ class ScenarioPlayer:
         self.results = None if rate else node.subscribe(PointCloud2, "~/fused", self._on_fused)
         self.since_s = time.monotonic()
 
-    def start(self, finish: Callable[[], None]) -> None:
-        """Begin to play; `finish` is called after the last step."""
+    def start(self, finish: Callable[[str], None]) -> None:
+        """Begin to play; after the last step `finish` is told how much that was."""
         self._finish = finish
         self._go_on()
         if self._rate:
@@ -108,10 +108,6 @@ class ScenarioPlayer:
             self._tell_time(self._stamp_ns())
         return f"no result of step {self._step} on {self.results.topic_name}."
 
-    def played(self) -> str:
-        """Say how much has been played."""
-        return f"{self._step} steps"
-
     def _go_on(self) -> None:
         """Publish the next step, or all up to the next that has a result to wait for; finish after the last."""
         while self._step < self._steps:
@@ -123,7 +119,7 @@ class ScenarioPlayer:
                 return
         if self._rate:
             self._pacer.cancel()
-        self._finish()
+        self._finish(f"{self._steps} steps")
 
     def _on_fused(self, msg: Any) -> None:
         if self._step and stamp_to_ns(msg.header.stamp) == self._stamp_ns():
