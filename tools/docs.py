@@ -159,7 +159,7 @@ def _rule_section(rule: dict[str, Any]) -> str:
 
 def scenarios_page() -> str:
     """Return doc/scenarios.md."""
-    from track_fusion.demo.bringup import demos_of
+    from track_fusion.demo.wiring import demos_of
     from track_fusion.scenarios import SCENARIOS
 
     rows = [(f"[`{s.key}`](#{s.key})", s.title, "yes" if demos_of(s.key) else "") for s in SCENARIOS.values()]
@@ -176,7 +176,7 @@ def scenarios_page() -> str:
 
 
 def _scenario_section(scenario: Scenario) -> str:
-    from track_fusion.demo.bringup import demos_of
+    from track_fusion.demo.wiring import demos_of
     from track_fusion.report.page import assumption_text
 
     demos = ", ".join(f"`track-fusion demo {name}`" for name in demos_of(scenario.key))

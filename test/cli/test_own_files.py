@@ -122,9 +122,9 @@ def test_the_own_scenario_is_judged(examples: Path, tmp_path: Path) -> None:
 def compared(*words: str) -> dict[str, Any]:
     result = run("compare", *words, "--json")
     assert result.exit_code == 0, result.stderr
-    found = strict_json(result.stdout)
-    assert isinstance(found, dict)
-    return found
+    answer = strict_json(result.stdout)
+    assert isinstance(answer, dict)
+    return answer
 
 
 def test_rules_are_compared_under_the_same_noise(examples: Path) -> None:
