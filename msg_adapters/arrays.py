@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+#: What stands for a position-velocity block that a message cannot carry: none, or a bound of every possible one.
+CrossBlock = Literal["block_diagonal", "conservative"]
 
 
 class MessageError(ValueError):

@@ -17,7 +17,7 @@ import numpy as np
 from geometry_msgs.msg import Point, Pose, PoseWithCovariance, Twist, TwistWithCovariance, Vector3
 from nav_msgs.msg import Odometry
 
-from msg_adapters.arrays import Floats, MessageError, TrackArrays, TrackLike, merged, one_track, slots_of
+from msg_adapters.arrays import CrossBlock, Floats, MessageError, TrackArrays, TrackLike, merged, one_track, slots_of
 from msg_adapters.header import make_header, stamp_to_ns
 from msg_adapters.orientation import from_yaw, rotation_matrix, unit_quaternion, yaw_of, yaw_rotations
 
@@ -31,8 +31,6 @@ UNOBSERVED_VARIANCE = 1e6
 #: "42", "track_42", "robot_1/track_42", "track42"; but not the last digits of a hexadecimal name.
 _NUMBERED = re.compile(r"(?:.*[_/#:.\-])?[A-Za-z]*?([0-9]+)", re.ASCII | re.DOTALL)
 _MAX_ID = 2**32 - 1
-
-CrossBlock = Literal["block_diagonal", "conservative"]
 
 
 class OdometryReading(NamedTuple):

@@ -120,6 +120,7 @@ def test_of_one_run_the_error_is_not_known() -> None:
     assert {f["verdict"] for f in answer["figures"]} == {"not given"}
 
 
+@pytest.mark.slow
 def test_without_runs_the_scenario_decides(files: Coin) -> None:
     assert reproduced(files.coin)["runs"] == 30
     assert files.asked() == {"coin.asked-0-0-20", "coin.asked-0-20-30"}
@@ -132,6 +133,7 @@ def test_several_names_give_a_list_each_once(files: Coin) -> None:
     assert len(files.asked()) == 5
 
 
+@pytest.mark.slow
 def test_no_figure_depends_on_the_number_of_processes(tmp_path: Path) -> None:
     texts = []
     for jobs in ("1", "3"):
@@ -251,6 +253,7 @@ def test_wrong_options_are_refused(words: tuple[str, ...], line: str, files: Coi
     assert files.asked() == set()
 
 
+@pytest.mark.slow
 def test_progress_with_time_left_is_shown_on_a_terminal_only(tmp_path: Path) -> None:
     ours, theirs = pty.openpty()
     shown: list[bytes] = []

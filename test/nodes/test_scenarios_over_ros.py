@@ -99,6 +99,8 @@ def chen2022() -> Iterator[Case]:
 
 
 CASES = [*li2022(), *chen2022()]
+#: One of each family of densities; the others are slow by their number.
+QUICK = {"li2022-nonlinear:arithmetic_average", "li2022-nonlinear-sir:alone", "chen2022-dynamic-1:mhdp_iterative"}
 RADARS, RADAR_STEPS = "sharma-radars", 40
 
 
@@ -138,7 +140,9 @@ def run(case: Case, context: Any, domain: int, folder: Path) -> tuple[list[Point
     return messages, json.loads(judged.read_text())
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
+@pytest.mark.parametrize(
+    "case", [c if str(c) in QUICK else pytest.param(c, marks=pytest.mark.slow) for c in CASES], ids=str
+)
 def test_the_nodes_give_the_numbers_of_the_library(
     case: Case, ros_context: Any, ros_domain: int, tmp_path: Path
 ) -> None:
@@ -175,6 +179,7 @@ def compare_figures(case: Case, judged: dict[str, Any], error: NDArray[np.float6
         assert judged[quantity] == pytest.approx(value, rel=TOLERANCE), quantity
 
 
+@pytest.mark.slow
 def test_radars_in_clutter_give_the_tracks_of_the_library(ros_context: Any, ros_domain: int, tmp_path: Path) -> None:
     """Every fusion depends on the one before: the centre fuses its own prediction, too."""
     pytest.importorskip("pymap3d")

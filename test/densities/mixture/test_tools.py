@@ -4,20 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from densities.mixture.test_mixture import draw
+from densities.mixture.examples import draw
 from scipy import integrate
 from scipy.optimize import minimize
 
 from track_fusion.densities.gaussian import kl_divergence
-from track_fusion.densities.mixture.mixture import (
-    Factored,
-    Mixture,
-    divergence,
-    extraction,
-    log_pdf,
-    moments,
-    reduction,
-)
+from track_fusion.densities.mixture import divergence, extraction, reduction
+from track_fusion.densities.mixture.mixture import Factored, Mixture, log_pdf, moments
 from track_fusion.linalg import Array
 
 
