@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from track_fusion.bags.read import open_bag
-from track_fusion.nodes.managed import ManagedNode, message_class, qos
+from track_fusion.nodes.managed import ManagedNode, class_of, qos
 from track_fusion.params import Fault, ParameterError, Params, param
 from track_fusion.tracks import SECOND_NS
 
@@ -65,7 +65,7 @@ class BagPlayer:
         wanted = set(params.topics) or known - {"/clock"}
         self._played = [c for c in self._reader.connections if c.topic in wanted]
         self._outputs = {
-            c.id: node.create_publisher(message_class(c.msgtype), names.get(c.topic, c.topic), qos(100))
+            c.id: node.create_publisher(class_of(c.msgtype), names.get(c.topic, c.topic), qos(100))
             for c in self._played
         }
         self.wanted = dict.fromkeys(self._outputs.values(), subscribers_each)
