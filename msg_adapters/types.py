@@ -5,11 +5,9 @@ from __future__ import annotations
 import dataclasses
 import importlib
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
-from msg_adapters.arrays import TrackArrays
-
-CrossBlock = Literal["block_diagonal", "conservative"]
+from msg_adapters.arrays import CrossBlock, TrackArrays
 
 
 class Reading(NamedTuple):

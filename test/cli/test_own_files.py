@@ -122,9 +122,9 @@ def test_the_own_scenario_is_judged(examples: Path, tmp_path: Path) -> None:
 def compared(*words: str) -> dict[str, Any]:
     result = run("compare", *words, "--json")
     assert result.exit_code == 0, result.stderr
-    found = strict_json(result.stdout)
-    assert isinstance(found, dict)
-    return found
+    answer = strict_json(result.stdout)
+    assert isinstance(answer, dict)
+    return answer
 
 
 def test_rules_are_compared_under_the_same_noise(examples: Path) -> None:
@@ -153,6 +153,7 @@ def test_parameters_are_given_by_rule(examples: Path) -> None:
     assert means[0] != means[1]
 
 
+@pytest.mark.slow
 def test_the_figures_depend_on_the_seed_alone(examples: Path) -> None:
     words = (str(examples / "two_thermometers.py"), "--rules", "naive", "--runs", "1100")
     assert compared(*words, "--jobs", "1") == compared(*words, "--jobs", "3")

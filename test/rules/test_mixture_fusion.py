@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from densities.mixture.test_mixture import draw
-from rules.test_mixture_averages import as_tracks
+from densities.mixture.examples import draw
+from rules.mixtures import as_tracks
 
 from track_fusion.densities.log_domain import normalised
 from track_fusion.densities.mixture.algebra import LogMixture, first_order, power, product

@@ -12,11 +12,12 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
+from msg_adapters.arrays import CrossBlock
 from msg_adapters.header import check_header
 from msg_adapters.markers import markers_to_msg
 from msg_adapters.odometry import odometry_to_msgs
 from msg_adapters.track_table import track_table_to_msg
-from msg_adapters.types import MESSAGE_TYPES, CrossBlock, MessageType
+from msg_adapters.types import MESSAGE_TYPES, MessageType
 from track_fusion.centre.centre import FusionCentre
 from track_fusion.centre.config import (
     MAX_SOURCES,
@@ -29,7 +30,8 @@ from track_fusion.centre.config import (
 )
 from track_fusion.centre.publish import StepInfo
 from track_fusion.models.choices import MOTIONS, MotionChoice
-from track_fusion.nodes.managed import ManagedNode, end, run
+from track_fusion.nodes.managed import ManagedNode
+from track_fusion.nodes.process import end, run
 from track_fusion.nodes.ros_params import chosen, declare
 from track_fusion.nodes.screening import FrameParams, screened_tracks
 from track_fusion.params import ParameterError, Params, param
