@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import textwrap
@@ -14,7 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from track_fusion.params import Params, specs
+from track_fusion.params import Params, Spec, specs
+from track_fusion.plugins import Registry
 
 if TYPE_CHECKING:
     from track_fusion.models.choices import Choice
@@ -97,7 +99,7 @@ def choosing_page() -> str:
     """Return doc/choosing-a-rule.md, written by hand but for its table of promises."""
     from track_fusion.rules import RULES
 
-    rows = [(f"[`{r.key}`](rules.md#{r.key})", r.guarantee, r.caveat, r.cost, r.source) for r in RULES.values()]
+    rows = [(f"[`{r.key}`](rules.md#{r.key})", r.guarantee, r.caveat, r.cost, r.source) for r in RULES.own.values()]
     return _filled("choosing-a-rule.md", _table(("rule", "promise", "when, or what breaks it", "cost", "source"), rows))
 
 
@@ -121,7 +123,7 @@ def rules_page() -> str:
     from track_fusion.cli.rules import describe
     from track_fusion.rules import RULES
 
-    described = [describe(rule) for rule in RULES.values()]
+    described = [describe(rule) for rule in RULES.own.values()]
     columns = ("rule", "family", "tracks", "guarantee", "source", "cost")
     rows = [(f"[`{r['key']}`](#{r['key']})", r["family"], r["arity"], r["guarantee"], r["source"], r["cost"])
             for r in described]  # fmt: skip
@@ -157,7 +159,7 @@ def _rule_section(rule: dict[str, Any]) -> str:
 
 def scenarios_page() -> str:
     """Return doc/scenarios.md."""
-    from track_fusion.demo.bringup import demos_of
+    from track_fusion.demo.wiring import demos_of
     from track_fusion.scenarios import SCENARIOS
 
     rows = [(f"[`{s.key}`](#{s.key})", s.title, "yes" if demos_of(s.key) else "") for s in SCENARIOS.values()]
@@ -174,7 +176,7 @@ def scenarios_page() -> str:
 
 
 def _scenario_section(scenario: Scenario) -> str:
-    from track_fusion.demo.bringup import demos_of
+    from track_fusion.demo.wiring import demos_of
     from track_fusion.report.page import assumption_text
 
     demos = ", ".join(f"`track-fusion demo {name}`" for name in demos_of(scenario.key))
@@ -212,9 +214,9 @@ def fusion_centre_sections() -> list[Section]:
     used = "read when state_fusion is"
     return [
         *map(Section, (FrameParams, SourceParams, MotionChoice)),
-        *_alternatives("motion", MOTIONS, MotionChoice().motion),
+        *_alternatives("motion", MOTIONS.own, MotionChoice().motion),
         *map(Section, (RuleParams, FusionCentreParams)),
-        *(Section(r.params, f"{key}.", f"{r.title}: {used} {key}.") for key, r in RULES.items() if specs(r.params)),
+        *(Section(r.params, f"{key}.", f"{r.title}: {used} {key}.") for key, r in RULES.own.items() if specs(r.params)),
         *map(Section, (ScanBufferParams, TrackManagerParams)),
         Section(RandomParams, title="Random numbers of rules that draw samples: seed, run and role name a stream."),
         Section(ManagedParams),
@@ -235,7 +237,7 @@ def sensor_tracker_sections() -> list[Section]:
     filters: dict[str, Choice[Any]] = {**TRACK_FILTERS, MULTI_TARGET: Choice(PdaTrackerParams, PdaTracker)}
     return [
         *map(Section, (FrameParams, TrackerChoice)),
-        *_alternatives("motion", MOTIONS, default.motion),
+        *_alternatives("motion", MOTIONS.own, default.motion),
         *_alternatives("sensor", SENSORS, default.sensor),
         *_alternatives("filter", filters, default.filter),
         *map(Section, (SensorTrackerParams, FeedbackParams, OutputParams, ManagedParams)),
@@ -266,12 +268,17 @@ def parameter_file(node: str, sections: Iterable[Section]) -> str:
         lines += ["", *_comment([f"--- {section.heading}"], "    ")]
         for name, (spec, default) in specs(section.params).items():
             unit = f" {spec.unit}" if spec.unit else ""
-            lines += _comment([f"{spec.doc} ({spec.wanted()}{',' + unit if unit else ''})"], "    ")
+            lines += _comment([f"{spec.doc} ({_ours(spec).wanted()}{',' + unit if unit else ''})"], "    ")
             # ROS has no list without entries: it stays unset.
             value = yaml_value(default) if default != () else "unset"
             mark = "" if section.declared and default != () else "# "
             lines.append(f"    {mark}{section.prefix}{name}: {value}")
     return "\n".join(lines) + "\n"
+
+
+def _ours(spec: Spec) -> Spec:
+    """Leave out of the choices what other packages on this machine bring."""
+    return dataclasses.replace(spec, choices=spec.choices.own) if isinstance(spec.choices, Registry) else spec
 
 
 def _comment(paragraphs: Iterable[str], indent: str) -> list[str]:

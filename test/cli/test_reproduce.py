@@ -191,11 +191,11 @@ class Page(HTMLParser):
 def test_the_page_is_whole_and_asks_for_nothing_from_outside(files: Coin) -> None:
     assert run("reproduce", files.coin, files.dice, "--out", "here").exit_code == 0
     text = Path("here/report.html").read_text(encoding="utf-8")
-    found = Page(text)
-    assert found.open == []
-    assert {r for r in found.references if not r.startswith("data:")} == {"#coin", "#dice"}
+    page = Page(text)
+    assert page.open == []
+    assert {r for r in page.references if not r.startswith("data:")} == {"#coin", "#dice"}
     assert "url(" not in text
-    words = " ".join(found.words)
+    words = " ".join(page.words)
     for wanted in (
         "A fair <coin>",
         "1.000 ± 0.010",
@@ -205,7 +205,7 @@ def test_the_page_is_whole_and_asks_for_nothing_from_outside(files: Coin) -> Non
         "it is fair",
     ):
         assert wanted in words
-    (picture, _) = [r for r in found.references if r.startswith("data:image/svg+xml")]
+    (picture, _) = [r for r in page.references if r.startswith("data:image/svg+xml")]
     image = base64.b64decode(picture.partition(",")[2]).decode()
     assert ElementTree.fromstring(image).tag == "{http://www.w3.org/2000/svg}svg"
     assert "Heads &amp; &lt;tails&gt;" in image

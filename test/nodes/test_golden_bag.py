@@ -134,8 +134,8 @@ def compare(messages: list[PointCloud2], oracle: str) -> None:
             assert getattr(got, field).tolist() == [t[field] for t in want], (at, field)
         assert got.weight.shape[1] == 1
         for k, track in enumerate(want):
-            for found, value in ((got.mean[k, 0], track["mean"]), (got.cov[k, 0], track["cov"])):
-                np.testing.assert_allclose(found, value, rtol=0, atol=TOLERANCE * np.abs(value).max(), err_msg=str(at))
+            for fused, value in ((got.mean[k, 0], track["mean"]), (got.cov[k, 0], track["cov"])):
+                np.testing.assert_allclose(fused, value, rtol=0, atol=TOLERANCE * np.abs(value).max(), err_msg=str(at))
 
 
 @pytest.mark.parametrize("name", [*RULES, "odometry"])

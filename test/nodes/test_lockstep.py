@@ -186,9 +186,9 @@ def library(rule: str | None) -> NDArray[np.float64]:
 
 def compare_with_library(messages: list[PointCloud2], rule: str | None) -> None:
     expected = library(rule)
-    found = np.array([positions(m)[0] for m in messages[: len(expected)]])
+    estimated = np.array([positions(m)[0] for m in messages[: len(expected)]])
     assert expected.shape == (100, 4)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE * np.abs(expected).max())
+    np.testing.assert_allclose(estimated, expected, rtol=0, atol=TOLERANCE * np.abs(expected).max())
 
 
 def test_covariance_intersection_agrees_with_the_library(once: list[PointCloud2]) -> None:

@@ -13,7 +13,7 @@ from cli.runner import ROOT
 from click.testing import CliRunner, Result
 
 from tools.docs import Section, docs, fusion_centre_sections, sensor_tracker_sections, yaml_value
-from track_fusion.demo.bringup import bringups
+from track_fusion.demo.wiring import bringups
 from track_fusion.params import specs
 from track_fusion.rules import RULES
 from track_fusion.scenarios import SCENARIOS

@@ -27,7 +27,7 @@ HISTORY_BITS = 32
 class RuleParams(Params):
     """How tracks are fused."""
 
-    state_fusion: str = param("covariance_intersection", "the fusion rule", choices=tuple(RULES))
+    state_fusion: str = param("covariance_intersection", "the fusion rule", choices=RULES)
 
 
 @dataclasses.dataclass(frozen=True)

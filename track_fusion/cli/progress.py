@@ -7,15 +7,16 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from track_fusion.cli.output import console
+
 if TYPE_CHECKING:
     from track_fusion.study.runs import Study, Work
 
 
 def studies(works: Sequence[Work], jobs: int, store: Path | None) -> Iterator[Study]:
     """Run studies, showing on a terminal how far each is; yield each as it is done."""
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-
-    from track_fusion.cli.output import console
     from track_fusion.study.runs import run_studies
 
     err = console(stderr=True)

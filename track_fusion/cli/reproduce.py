@@ -10,6 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from rich.markup import escape
+
+from track_fusion.cli import output
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -60,7 +63,6 @@ def reproduce(
       track-fusion reproduce --all --out out/all
       track-fusion reproduce ./my_scenario.py --json
     """  # noqa: D301  click reads \b as "do not wrap"
-    from track_fusion.cli.output import print_json
     from track_fusion.cli.progress import studies
     from track_fusion.scenarios import SCENARIOS, find_scenario
     from track_fusion.study.runs import Work
@@ -79,15 +81,15 @@ def reproduce(
 
     chosen = tuple(SCENARIOS) if every else tuple(dict.fromkeys(names))
     works = [Work(name, find_scenario, wanted(find_scenario(name)), seed, only) for name in chosen]
-    found = []
+    judged = []
     for study in studies(works, jobs or os.cpu_count() or 1, out / "pieces"):
-        found.append((study, _result(study)))
+        judged.append((study, _result(study)))
         if not as_json:
-            _print_tables(find_scenario(study.work.scenario), found[-1][1], study.took_s)
-    _write(out, found)
+            _print_tables(find_scenario(study.work.scenario), judged[-1][1], study.took_s)
+    _write(out, judged)
     if as_json:
-        results = [result for _, result in found]
-        print_json(results[0] if len(results) == 1 else results)
+        results = [result for _, result in judged]
+        output.print_json(results[0] if len(results) == 1 else results)
     else:
         click.echo(f"Written: {out / 'report.html'}, {out / 'results.json'}")
 
@@ -107,20 +109,19 @@ def _result(study: Study) -> dict[str, Any]:
     }
 
 
-def _write(out: Path, found: list[tuple[Study, dict[str, Any]]]) -> None:
+def _write(out: Path, judged: list[tuple[Study, dict[str, Any]]]) -> None:
     """Write results.json, which is the same whenever the figures are, and report.html."""
     import numpy as np
 
     from track_fusion.cli.app import version
-    from track_fusion.cli.output import plain
     from track_fusion.report.page import Section, page
     from track_fusion.scenarios import find_scenario
 
     sections = []
-    for study, result in found:
+    for study, result in judged:
         scenario = find_scenario(study.work.scenario)
         sections.append(Section(result, scenario, scenario.charts(study.samples), study.took_s))
-    content = [{**plain(s.result), "charts": plain(s.charts)} for s in sections]
+    content = [{**output.plain(s.result), "charts": output.plain(s.charts)} for s in sections]
     (out / "results.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     made = f"track_fusion {version()}, NumPy {np.__version__}, {time.strftime('%Y-%m-%d %H:%M')}"
     (out / "report.html").write_text(page(sections, made), encoding="utf-8")
@@ -128,12 +129,9 @@ def _write(out: Path, found: list[tuple[Study, dict[str, Any]]]) -> None:
 
 def _print_tables(scenario: Scenario, result: dict[str, Any], took_s: float) -> None:
     """Print a table a quantity, then the claims."""
-    from rich.markup import escape
-
-    from track_fusion.cli.output import console, grid, table
     from track_fusion.report.page import assumption_text, by_quantity, evidence_text, unpublished
 
-    out = console()
+    out = output.console()
     out.print(f"[bold]{escape(scenario.key)}[/bold]  {escape(scenario.title)}")
     groups = by_quantity(result["figures"])
     folded = unpublished(groups)
@@ -143,7 +141,7 @@ def _print_tables(scenario: Scenario, result: dict[str, Any], took_s: float) -> 
     if folded:
         out.print(f"\n{sum(len(groups[q]) for q in folded)} figures with nothing published: see report.html")
     if result["claims"]:
-        claims = table("claim", "verdict", title="claims")
+        claims = output.table("claim", "verdict", title="claims")
         for c in result["claims"]:
             claims.add_row(
                 escape(f"{c['claim']} ({evidence_text(c['evidence'])})"), f"[{STYLES[c['verdict']]}]{c['verdict']}[/]"
@@ -154,20 +152,17 @@ def _print_tables(scenario: Scenario, result: dict[str, Any], took_s: float) -> 
         ("Runs", f"{result['runs']}, seed {result['seed']}, {took_s:.1f} s of one processor"),
         ("Paper", scenario.paper),
     ]
-    out.print(grid([*facts, *(("Assumed", assumption_text(a)) for a in scenario.assumptions)]))
+    out.print(output.grid([*facts, *(("Assumed", assumption_text(a)) for a in scenario.assumptions)]))
 
 
 def _table(quantity: str, figures: Sequence[Mapping[str, Any]]) -> Table:
-    from rich.markup import escape
-
-    from track_fusion.cli.output import table
     from track_fusion.report.page import measured_text, published_text, quantity_text
 
     title = f"{quantity_text(quantity)}, ± standard error"
-    found = table("filter and rule", "measured", "published", "verdict", title=title)
-    found.columns[1].justify = found.columns[2].justify = "right"
+    compared = output.table("filter and rule", "measured", "published", "verdict", title=title)
+    compared.columns[1].justify = compared.columns[2].justify = "right"
     for f in figures:
         verdict = f"[{STYLES[f['verdict']]}]{f['verdict']}[/]"
         measured = measured_text(f["value"], f["standard_error"])
-        found.add_row(escape(f["name"].rpartition("/")[0]), measured, published_text(f["published"]), verdict)
-    return found
+        compared.add_row(escape(f["name"].rpartition("/")[0]), measured, published_text(f["published"]), verdict)
+    return compared
