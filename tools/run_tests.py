@@ -33,7 +33,7 @@ PYTHON = ROOT / ".venv" / "bin" / "python"
 EXECUTABLES = ("sensor_tracker", "fusion_centre", "replay", "evaluator", "track-fusion")
 # Not .venv/bin/colcon: with a sourced ROS, colcon may be the system's, whose tests would not see the environment.
 COLCON = "import sys; from colcon_core.command import main; sys.exit(main())"
-EXTRAS = ("click", "rich", "rosbags", "matplotlib")
+EXTRAS = ("click", "jsonschema", "rich", "rosbags", "matplotlib")
 FLOOR = ("numpy==1.26.*", "scipy==1.11.*")
 FLOOR_PYTHONS = ((3, 11), (3, 12))  # NumPy 1.26 has no wheel for later ones
 # Two tests at a time on two cores; a file's tests stay together, for they share processes.

@@ -13,14 +13,9 @@ from track_fusion.scenarios import SCENARIOS, Scenario, Scene, get_scenario
 
 #: How a scenario's rows name what the tracker nodes run.
 ROWS = {
-    "kalman": "kf",
-    "extended": "ekf",
-    "unscented": "ukf",
-    "cubature": "ckf",
-    "particle": "sir",
-    "student_t": "stf",
+    "kalman": "kf", "extended": "ekf", "unscented": "ukf", "cubature": "ckf", "particle": "sir", "student_t": "stf",
     "pda": "pda",
-}
+}  # fmt: skip
 #: Rules that a scenario which has them all is shown with; the last is recorded and drawn.
 RULES = ("naive", "covariance_intersection", "arithmetic_average")
 #: Library runs to compare with where they cost little.

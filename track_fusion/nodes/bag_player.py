@@ -83,7 +83,8 @@ class BagPlayer:
 
     def _rewind(self) -> None:
         start = self._reader.start_time + round(self._params.start_offset_s * SECOND_NS)
-        self._messages: Iterator[Any] = self._reader.messages(connections=self._played, start=start)
+        # Of no connection the reader would give all messages.
+        self._messages: Iterator[Any] = iter(self._reader.messages(self._played, start) if self._played else ())
         self._next = next(self._messages, None)
         self._origin_ns, self._wall_start = start, time.monotonic()
         if self._next is None:

@@ -93,7 +93,7 @@ class ManagedNode(LifecycleNode):
         backward = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
         self._jump = self.get_clock().create_jump_callback(backward, post_callback=self._on_jump)
         if self.managed.autostart:
-            self.autostart()
+            self._autostart()
 
     # What subclasses fill in.
 
@@ -121,14 +121,8 @@ class ManagedNode(LifecycleNode):
 
     # Lifecycle.
 
-    def autostart(self) -> None:
-        """Configure and activate; rclpy has no such thing.
-
-        Raises
-        ------
-        Fault             a transition failed (an unforeseen error is in the log)
-        ParameterError    it failed because a value is wrong
-        """
+    def _autostart(self) -> None:
+        """Configure and activate; rclpy has no such thing. Raise what made it fail; the log has an unforeseen error."""
         transitions: list[Callable[[], Any]] = [self.trigger_configure, self.trigger_activate]
         for transition in transitions:
             if transition() != TransitionCallbackReturn.SUCCESS:
