@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from msg_adapters.arrays import TrackArrays
 from msg_adapters.odometry import odometry_from_msg, odometry_to_msgs
 from msg_adapters.track_table import track_table_from_msg
 from track_fusion.bags.read import read_bag
-from track_fusion.params import Fault
 from track_fusion.tracks import TrackBatch, planar_layout
 
 GOLDEN = Path(__file__).resolve().parents[1] / "data" / "golden" / "tracks"
@@ -57,19 +55,3 @@ def test_odometry_too(storage: StoragePlugin, tmp_path: Path) -> None:
         assert type(again) is not Odometry
         wanted, got = (odometry_from_msg(m, batch.layout.axes).tracks for m in (msg, again))
         assert_same(got, wanted)
-
-
-def test_a_topic_without_messages_is_an_empty_list() -> None:
-    assert read_bag(GOLDEN, ["/nowhere"]) == {"/nowhere": []}
-
-
-@pytest.mark.parametrize("path", [Path("/nowhere/bag"), GOLDEN.parent])
-def test_what_is_no_bag_is_named(path: Path) -> None:
-    with pytest.raises(Fault, match=rf"^The 'bag' parameter must be a rosbag2 directory\. Got '{path}': "):
-        read_bag(path, TOPICS)
-
-
-def test_a_missing_package_is_named_with_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
-    with pytest.raises(Fault, match=r"^Reading a bag needs the Python package rosbags: pip install rosbags\."):
-        read_bag(GOLDEN, TOPICS)
