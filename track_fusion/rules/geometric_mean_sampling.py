@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from track_fusion.densities.mean_density import fit_mean_density, sample_mean_density
+from track_fusion.densities.mixture.mean_density import fit_mean_density, sample_mean_density
 from track_fusion.densities.mixture.mixture import chosen
 from track_fusion.params import param
 from track_fusion.rules.base import FusedTracks, Rule, SourceTracks

@@ -8,7 +8,6 @@ from densities.mixture.test_mixture import draw
 from scipy.optimize import minimize
 
 from track_fusion.densities.mixture.algebra import LogMixture
-from track_fusion.densities.mixture.divergence import grid
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments
 from track_fusion.densities.mixture.quotient import (
     Quotient,
@@ -20,6 +19,7 @@ from track_fusion.densities.mixture.quotient import (
     wep_bound,
     wep_quotient,
 )
+from track_fusion.densities.on_grid import grid
 from track_fusion.linalg import Array
 
 

@@ -10,13 +10,14 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from track_fusion.densities.mixture.mixture import Mixture
+from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.params import ParameterError, from_dict
 from track_fusion.rules import RULES
 from track_fusion.scenarios import judged_claims
 from track_fusion.scenarios.ahmed import proposals as ahmed_proposals
 from track_fusion.scenarios.ahmed import random as ahmed_random
-from track_fusion.scenarios.ahmed.mixtures import CELL_AREA, GRID, Problem, divergence, log_fused, random_mixture
+from track_fusion.scenarios.ahmed.mixtures import CELL_AREA, GRID, Problem, log_fused, random_mixture
 from track_fusion.study.scenario import RuleChoice, Samples
 
 #: ERRATA speaks of medians over 20 or more problems.
@@ -156,7 +157,7 @@ def test_divergence_on_the_grid_is_that_of_gaussians_in_closed_form() -> None:
     inverse = np.linalg.inv(other)
     size = np.log(np.linalg.det(other) / np.linalg.det(cov))
     wanted = 0.5 * (np.trace(inverse @ cov) + gap @ inverse @ gap - 2.0 + size)
-    assert divergence(*logs) == pytest.approx(wanted, rel=1e-6)
+    assert kl_on_grid(*logs) == pytest.approx(wanted, rel=1e-6)
 
 
 @pytest.mark.parametrize("rule", ["mixture_exact", "mixture_wep"])
@@ -165,7 +166,7 @@ def test_single_components_are_fused_without_error(rule: str) -> None:
     fused = RULES[rule].fuse(problem.tracks(np.random.default_rng(0)), RULES[rule].params())
     omega = 0.0 if fused.weights is None else float(fused.weights[0])
     truth = problem.log_exact() if rule == "mixture_exact" else problem.log_wep(omega)
-    assert divergence(truth, log_fused(fused)) == pytest.approx(0.0, abs=1e-9)
+    assert kl_on_grid(truth, log_fused(fused)) == pytest.approx(0.0, abs=1e-9)
 
 
 # Proposals.

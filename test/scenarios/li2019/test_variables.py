@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scenarios.li2019.quadrature import positive_normal_pair
 from scipy.stats import kstest, multivariate_normal, norm, poisson
 
 from track_fusion.params import ParameterError
 from track_fusion.scenarios import judged_claims
-from track_fusion.scenarios.li2019.averages import average_moments, positive_normal_pair
+from track_fusion.scenarios.li2019.averages import average_moments
 from track_fusion.scenarios.li2019.variable_pairs import RATES, copula_correlation, normal_pair, poisson_pair
 from track_fusion.scenarios.li2019.variables import (
     AA,

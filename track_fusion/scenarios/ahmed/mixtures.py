@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.log_domain import normalised
-from track_fusion.densities.mixture.divergence import grid, kl_on_grid
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments, stacked
 from track_fusion.densities.mixture.quotient import exact_bound, exact_quotient
+from track_fusion.densities.on_grid import grid, kl_on_grid
 from track_fusion.linalg import Array, transpose
 from track_fusion.random_streams import stream
 from track_fusion.rules import RULES, FusedTracks, SourceTracks
@@ -85,11 +85,6 @@ class Problem:
         return omega * log_pdf(self.first, points) + (1.0 - omega) * log_pdf(self.second, points)
 
 
-def divergence(log_truth: Array, log_fused: Array) -> float:
-    """Divergence in nats of densities given on GRID by their logarithms (CELLS^2,), each normalised there."""
-    return kl_on_grid(lambda x: log_truth, lambda x: log_fused, GRID)
-
-
 def log_fused(fused: FusedTracks) -> Array:
     """Logarithm on GRID of a fused density: its mixture, or the Gaussian of its moments."""
     if fused.mixture is not None:
@@ -151,6 +146,6 @@ def compare(
         truth = problem.log_exact()
         for choice in rules:
             fused = RULES[choice.key].fuse(problem.tracks(stream(seed, run, "fusion")), choice.params)
-            found[f"given-{choice.name}/kld_nats"][row] = divergence(truth, log_fused(fused))
+            found[f"given-{choice.name}/kld_nats"][row] = kl_on_grid(truth, log_fused(fused))
         progress((row + 1) / len(runs))
     return found

@@ -26,6 +26,7 @@ from track_fusion.densities.mixture.quotient import (
     exact_quotient,
     laplace,
 )
+from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.params import from_dict
 from track_fusion.random_streams import stream
@@ -37,7 +38,6 @@ from track_fusion.scenarios.ahmed.mixtures import (
     Problem,
     compare,
     contour_chart,
-    divergence,
     shown,
 )
 from track_fusion.study.chart import Chart, Series
@@ -115,9 +115,9 @@ class Case:
                 "ess_1": float(share.mean()),
                 "weighted_ess_1": float(share @ normalised(self.log_weight)),
             }
-        found = log_pdf(fused, GRID)
-        pictures = {"density": shown(found), "truth": shown(truth)}
-        return {"kld_nats": divergence(truth, found)} | values | pictures
+        approximation = log_pdf(fused, GRID)
+        pictures = {"density": shown(approximation), "truth": shown(truth)}
+        return {"kld_nats": kl_on_grid(truth, approximation)} | values | pictures
 
     def _bounded(self) -> dict[str, Any]:
         bound, share = self.bound.log_weight, normalised(self.log_weight)

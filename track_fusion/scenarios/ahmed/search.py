@@ -10,9 +10,9 @@ from functools import partial
 import numpy as np
 
 from track_fusion.densities.log_domain import normalised
-from track_fusion.densities.mixture.divergence import grid
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.densities.mixture.reduction import prune, runnalls
+from track_fusion.densities.on_grid import grid, kl_on_grid
 from track_fusion.filters import negative_information
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
@@ -191,19 +191,11 @@ def _searched_by_each(start: Mixture, progress: Progress) -> dict[str, Mixture]:
 def _measured(row: str, density: Array, centre: Array, truth: Array) -> Samples:
     near = (POINTS**2).sum(-1) < NEAR_M**2
     found = {
-        f"{row}/kld_from_bayes_nats": divergence(truth, density),
+        f"{row}/kld_from_bayes_nats": kl_on_grid(truth, density),
         f"{row}/mass_near_target_1": normalised(density)[:, near].sum(-1),
         row: _thinned(density),
     }
-    return found if row == CENTRE else {f"{row}/kld_nats": divergence(centre, density)} | found
-
-
-def divergence(log_first: Array, log_second: Array) -> Array:
-    """Kullback-Leibler divergence first || second (R,) of log-densities (R, G) on the grid, each normalised there."""
-    first = normalised(log_first)
-    second = normalised(log_second)
-    ratio = np.log(np.maximum(first, 1e-300)) - np.log(np.maximum(second, 1e-300))
-    return np.asarray((first * ratio).sum(-1))
+    return found if row == CENTRE else {f"{row}/kld_nats": kl_on_grid(centre, density)} | found
 
 
 def _thinned(log_density: Array) -> Array:
@@ -236,7 +228,7 @@ def _compared(run: int, seed: int, rules: Sequence[RuleChoice], progress: Progre
     local, found = _searched_by_each(start, progress), {}
     for done, choice in enumerate(rules):
         density = log_pdf(fused(choice, start, local, seed), POINTS)
-        found[f"gm-{choice.name}/kld_nats"] = divergence(centre, density)
+        found[f"gm-{choice.name}/kld_nats"] = kl_on_grid(centre, density)
         progress(0.5 + 0.5 * (done + 1) / len(rules))
     return found
 

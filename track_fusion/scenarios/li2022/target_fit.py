@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from track_fusion.densities.gaussian import kl_divergence
-from track_fusion.densities.mixture.divergence import kl_on_grid
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf
+from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.rules import RULES, FusedTracks, SourceTracks
@@ -117,7 +117,7 @@ def divergence(mean: Array, cov: Array, case: str) -> Array:
 def mixed_divergence(weights: Array, case: str) -> float:
     """Divergence of the mixture at weights (4,) from the target, in nats, by summation over POINTS."""
     mixed, target = Mixture(weights, DENSITIES[:, :1], DENSITIES[:, 1:, None]), target_of(case)
-    return kl_on_grid(lambda x: log_pdf(mixed, x), lambda x: log_pdf(target, x), POINTS)
+    return float(kl_on_grid(log_pdf(mixed, POINTS), log_pdf(target, POINTS)))
 
 
 def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:

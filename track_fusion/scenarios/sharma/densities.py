@@ -8,9 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
-from track_fusion.densities.mean_density import Kind, log_mean_density
-from track_fusion.densities.mixture.divergence import grid, kl_on_grid, moments_on_grid
+from track_fusion.densities.mixture.mean_density import Kind, log_mean_density
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments
+from track_fusion.densities.on_grid import grid, kl_on_grid, moments_on_grid
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.random_streams import stream
@@ -66,13 +66,13 @@ class Pair:
 
     def by_grid(self, kind: Kind, inflation: float = 1.0) -> Row:
         """Take the moments of a mean density by summation; `inflation`: those that samples of wider densities have."""
+        wide = dataclasses.replace(self.parts, cov=inflation * self.parts.cov)
 
-        def density(points: Array) -> Array:
-            wide = dataclasses.replace(self.parts, cov=inflation * self.parts.cov)
-            drawn, meant = (np.logaddexp(*log_pdf(parts, points[None])) for parts in (wide, self.parts))
-            return np.asarray(self.log_mean(points, kind) + drawn - meant)
+        def fuse(rng: np.random.Generator) -> FusedTracks:
+            drawn, meant = (np.logaddexp(*log_pdf(parts, POINTS[None])) for parts in (wide, self.parts))
+            return FusedTracks(*moments_on_grid(self.log_mean(POINTS, kind) + drawn - meant, POINTS))
 
-        return Row(self, lambda rng: FusedTracks(*moments_on_grid(density, POINTS)))
+        return Row(self, fuse)
 
     @cached_property
     def exact(self) -> Array:
@@ -82,7 +82,7 @@ class Pair:
     def divergence(self, fused: FusedTracks) -> float:
         """Kullback-Leibler divergence of the exact harmonic mean density from what was fused, in nats."""
         mixture = fused.mixture or Mixture(np.ones(1), fused.mean[None], fused.cov[None])
-        return kl_on_grid(lambda points: self.exact, lambda points: log_pdf(mixture, points), POINTS)
+        return float(kl_on_grid(self.exact, log_pdf(mixture, POINTS)))
 
     def compare(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
         """Fuse by any rules: divergence of the exact harmonic mean density from each result, (R,).

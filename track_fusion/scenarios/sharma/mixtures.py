@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from track_fusion.densities.mean_density import Kind
+from track_fusion.densities.mixture.mean_density import Kind
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
