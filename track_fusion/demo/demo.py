@@ -33,7 +33,7 @@ from track_fusion.params import ParameterError, specs, unknown_name_error
 from track_fusion.report.picture import Line, draw, draw_map
 from track_fusion.rules import get_rule
 from track_fusion.scenarios import SCENARIOS, RuleChoice, Scenario, get_scenario, judged_figures
-from track_fusion.study.scenario import Scene
+from track_fusion.study.scene import Scene
 from track_fusion.tracks import StateLayout, TrackBatch
 
 #: How a scenario's rows name what the tracker nodes run.
@@ -165,11 +165,11 @@ def _library(demo: Demo, rows: list[str], progress: Callable[[float], None]) -> 
             progress((done + share) / len(wanted))
 
         try:
-            samples = demo.scenario.sample(range(demo.library_runs), demo.seed, part, only)
+            outcomes = demo.scenario.simulate(range(demo.library_runs), demo.seed, part, only)
         except ParameterError:
             continue
         for found, runs in ((same, 1), (many, demo.library_runs)):
-            found |= demo.scenario.figures({name: array[:runs] for name, array in samples.items()})
+            found |= demo.scenario.figures({name: array[:runs] for name, array in outcomes.items()})
     progress(1.0)
     return same, many
 

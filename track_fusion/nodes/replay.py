@@ -111,7 +111,7 @@ class ReplayNode(ManagedNode):
                 raise unknown_name_error(name, self._scene.sensors, "sensor")
         self._steps = self.params.steps or self._scene.steps
         draw = self.params.seed, self.params.run, self._steps
-        self._states, self._drawn = self._scene.truth(*draw), self._scene.detections(*draw)
+        self._states, self._drawn = self._scene.states(*draw), self._scene.detections(*draw)
         self._truth = self.publisher(Odometry, "~/truth", depth=100)
         self._detections = {name: self.publisher(PointCloud2, f"~/{name}/detections") for name in names}
         self._wanted = dict.fromkeys(self._detections.values(), self.params.expected_subscribers_each)

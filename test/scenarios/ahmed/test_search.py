@@ -9,7 +9,7 @@ from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.params import ParameterError
 from track_fusion.rules import RULES
 from track_fusion.scenarios.ahmed import search
-from track_fusion.study.scenario import RuleChoice
+from track_fusion.study.rule_choice import RuleChoice
 
 RUNS = [0]
 
@@ -84,11 +84,11 @@ def test_the_target_is_seldom_seen_where_the_paper_has_it():
 def test_pieces_equal_the_whole_and_figures_cope_with_a_part(monkeypatch):
     monkeypatch.setattr(search, "STEPS", 1)
     shares = []
-    whole = search.sample([2, 5], 1, shares.append, "gm-mixture_exact@mmgd")
+    whole = search.simulate([2, 5], 1, shares.append, "gm-mixture_exact@mmgd")
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
     for run, at in ((2, 0), (5, 1)):
-        part = search.sample([run], 1, lambda share: None, "gm-mixture_exact@mmgd")
+        part = search.simulate([run], 1, lambda share: None, "gm-mixture_exact@mmgd")
         for name, values in part.items():
             np.testing.assert_allclose(values[0], whole[name][at], rtol=1e-12, err_msg=name)
     assert set(search.figures(whole)) == {

@@ -17,7 +17,8 @@ from track_fusion.linalg import Array, transpose
 from track_fusion.random_streams import stream
 from track_fusion.rules import RULES, FusedTracks, SourceTracks
 from track_fusion.study.chart import Chart, Contours
-from track_fusion.study.scenario import Progress, RuleChoice, Samples, check_needs
+from track_fusion.study.rows import Outcomes, Progress
+from track_fusion.study.rule_choice import RuleChoice, check_needs
 
 #: Half the sides of the squares in which the sources' and the common information's means lie.
 SOURCE_HALF, COMMON_HALF = 14.0, 20.0
@@ -132,7 +133,7 @@ def compare(
     runs: Sequence[int],
     seed: int,
     progress: Progress,
-) -> Samples:
+) -> Outcomes:
     """Fuse the problems draw(seed, run) by any rules: divergence of the exactly fused density from what each gives.
 
     Raises
@@ -140,7 +141,7 @@ def compare(
     ParameterError    a rule needs more beside the tracks than their common information
     """
     check_needs(rules, ("common",))
-    found: Samples = {f"given-{choice.name}/kld_nats": np.empty(len(runs)) for choice in rules}
+    found: Outcomes = {f"given-{choice.name}/kld_nats": np.empty(len(runs)) for choice in rules}
     for row, run in enumerate(runs):
         problem = draw(seed, run)
         truth = problem.log_exact()

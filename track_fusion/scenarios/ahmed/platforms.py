@@ -20,7 +20,7 @@ from track_fusion.models.turn import KnownTurn, KnownTurnParams
 from track_fusion.peers.peer import Fuse, Peer, Schedule, communicate, gaussian, ring, sources
 from track_fusion.random_streams import stream
 from track_fusion.rules import RULES
-from track_fusion.study.scenario import RuleChoice, check_needs
+from track_fusion.study.rule_choice import RuleChoice, check_needs
 from track_fusion.tracks import StateLayout
 
 LAYOUT = StateLayout(("x", "vx", "y", "vy"))

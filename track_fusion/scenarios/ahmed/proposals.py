@@ -41,7 +41,10 @@ from track_fusion.scenarios.ahmed.mixtures import (
     shown,
 )
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.scenario import Claim, Printed, Progress, RuleChoice, Samples, Scenario, chosen
+from track_fusion.study.claims import Claim, Printed
+from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Scenario
 
 #: Fig. 7: divergence in nats of the true fused density from each approximation, one problem.
 FIGURE_7 = {
@@ -136,7 +139,7 @@ class Case:
         }
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Sample one problem a run from the proposals of the rows that start with `only`.
 
     Returns
@@ -158,14 +161,14 @@ def _row(variant: str, quantity: str) -> str:
     return f"given-mixture_exact@{variant}/{quantity}"
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Medians of divergences and of looseness over the problems, means of all else; comparisons of the proposals."""
     found = {}
-    for name, values in samples.items():
+    for name, values in outcomes.items():
         if values.ndim == 1:
             average = Estimate.median if name.endswith("_nats") else Estimate.mean
             found[name] = average(values)
-    ess = {proposal: samples.get(_row(proposal, "mixands")) for proposal in PROPOSALS}
+    ess = {proposal: outcomes.get(_row(proposal, "mixands")) for proposal in PROPOSALS}
     naive, local, heavy = ess.values()
     if naive is not None and local is not None and heavy is not None:
         found[_row("ingis", "beaten_1")] = Estimate.mean((np.maximum(local, heavy) > naive).mean(1))
@@ -173,27 +176,27 @@ def figures(samples: Samples) -> dict[str, Estimate]:
     return found
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Fig. 7 and Fig. 8 for the first problem, and effective samples over all problems."""
-    return [*_densities(samples), *_first_mixands(samples), *_all_mixands(samples)]
+    return [*_densities(outcomes), *_first_mixands(outcomes), *_all_mixands(outcomes)]
 
 
-def _densities(samples: Samples) -> Iterator[Chart]:
+def _densities(outcomes: Outcomes) -> Iterator[Chart]:
     for variant in ROWS.values():
-        density = samples.get(_row(variant, "density"))
+        density = outcomes.get(_row(variant, "density"))
         if density is not None:
-            pictures = {"true density": samples[_row(variant, "truth")][0], variant: density[0]}
+            pictures = {"true density": outcomes[_row(variant, "truth")][0], variant: density[0]}
             yield contour_chart(f"First problem, 16 mixands: {variant.replace('_', ' ')}", pictures)
-    heaviest = samples.get(_row("bound", "heaviest"))
+    heaviest = outcomes.get(_row("bound", "heaviest"))
     if heaviest is not None:
         yield contour_chart("First problem: its heaviest mixand", {"true density": heaviest[0]})
 
 
-def _first_mixands(samples: Samples) -> Iterator[Chart]:
-    ess = [(p, samples[_row(p, "mixands")][0]) for p in PROPOSALS if _row(p, "mixands") in samples]
+def _first_mixands(outcomes: Outcomes) -> Iterator[Chart]:
+    ess = [(p, outcomes[_row(p, "mixands")][0]) for p in PROPOSALS if _row(p, "mixands") in outcomes]
     lines = [Series(proposal, np.arange(1.0, len(share) + 1), share, "points") for proposal, share in ess]
-    if _row("bound", "mixands") in samples:
-        bound, true = (samples[_row("bound", name)][0] for name in ("mixands", "true_mixands"))
+    if _row("bound", "mixands") in outcomes:
+        bound, true = (outcomes[_row("bound", name)][0] for name in ("mixands", "true_mixands"))
         at, top = np.arange(1.0, len(bound) + 1), log_sum_exp(true)
         if lines:
             lines.append(Series("true weight", at, np.exp(true - top), "bars"))
@@ -203,12 +206,12 @@ def _first_mixands(samples: Samples) -> Iterator[Chart]:
         yield Chart("First problem: effective samples", "mixand", "share of 500 samples", tuple(lines))
 
 
-def _all_mixands(samples: Samples) -> Iterator[Chart]:
+def _all_mixands(outcomes: Outcomes) -> Iterator[Chart]:
     shares = np.linspace(0.0, 1.0, 101)
     lines = [
-        Series(p, shares, (samples[_row(p, "mixands")].reshape(-1, 1) < shares).mean(0))
+        Series(p, shares, (outcomes[_row(p, "mixands")].reshape(-1, 1) < shares).mean(0))
         for p in PROPOSALS
-        if _row(p, "mixands") in samples
+        if _row(p, "mixands") in outcomes
     ]
     if lines:
         yield Chart(
@@ -280,7 +283,7 @@ SCENARIO = Scenario(
         "the true density, its mixands and their weights are taken on a grid of 100 x 100 cells over +-28",
         "share of effective samples: ess averages over the mixands alike, weighted_ess by their true weights",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=CLAIMS,

@@ -24,7 +24,10 @@ from track_fusion.scenarios.ahmed.mixtures import (
     shown,
 )
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.scenario import Claim, Printed, Progress, RuleChoice, Samples, Scenario, chosen
+from track_fusion.study.claims import Claim, Printed
+from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Scenario
 
 #: Figs. 4 and 5, one problem: divergence in nats of the true fused density from each approximation.
 FIGURES_4_5 = {
@@ -162,7 +165,7 @@ def _samples_of(choice: RuleChoice) -> int:
     return int(getattr(params, names[method])) if method in names else 0
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Fuse a problem a run by the methods whose rows start with `only`: divergence, effective samples, time, (R,).
 
     Notes    Times, `.../time_ratio_1`, are measured by the clock: they alone differ from one call to the next.
@@ -178,25 +181,25 @@ def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -
     return {name: np.array(values) for name, values in found.items()}
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Medians over the problems."""
-    return {name: Estimate.median(values) for name, values in samples.items() if values.ndim == 1}
+    return {name: Estimate.median(values) for name, values in outcomes.items() if values.ndim == 1}
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Divergence by method over all problems, Fig. 6; the first example's densities, Figs. 4 and 5."""
-    return [*_divergences(samples), *_densities(samples)]
+    return [*_divergences(outcomes), *_densities(outcomes)]
 
 
-def _divergences(samples: Samples) -> Iterator[Chart]:
+def _divergences(outcomes: Outcomes) -> Iterator[Chart]:
     for key, title in (("mixture_exact", "Exact fusion"), ("mixture_wep", "WEP fusion")):
         start = f"given-{key}@"
-        names = [n for n in samples if n.startswith(start) and n.endswith("/kld_nats") and "@example" not in n]
+        names = [n for n in outcomes if n.startswith(start) and n.endswith("/kld_nats") and "@example" not in n]
         if not names:
             continue
         at = np.arange(len(names), dtype=float)
-        each = np.array([samples[n][:SHOWN_PROBLEMS] for n in names])
-        median = np.array([np.median(samples[n]) for n in names])
+        each = np.array([outcomes[n][:SHOWN_PROBLEMS] for n in names])
+        median = np.array([np.median(outcomes[n]) for n in names])
         ticks = {x: n.removeprefix(start).removesuffix("/kld_nats") for x, n in zip(at, names, strict=True)}
         family = [n.rstrip("0123456789") for n in ticks.values()]
         breaks = [i for i in range(1, len(names)) if family[i] != family[i - 1]]
@@ -207,13 +210,13 @@ def _divergences(samples: Samples) -> Iterator[Chart]:
         yield Chart(f"{title}: divergence from the truth", "method and samples", "nats", lines, log_y=True, ticks=ticks)
 
 
-def _densities(samples: Samples) -> Iterator[Chart]:
+def _densities(outcomes: Outcomes) -> Iterator[Chart]:
     for density, name in PICTURES.items():
-        if density in samples:
+        if density in outcomes:
             key, _, method = name.removeprefix("given-").partition("@example_")
             method = method.upper().replace("_", " with ")
             title = f"{'Exact' if key == 'mixture_exact' else 'WEP'} fusion, first example: {method}"
-            pictures = {"true density": samples[f"{name}/truth"][0], method: samples[density][0]}
+            pictures = {"true density": outcomes[f"{name}/truth"][0], method: outcomes[density][0]}
             yield contour_chart(title, pictures)
 
 
@@ -293,7 +296,7 @@ SCENARIO = Scenario(
         "times are processor times of one problem, in those of MMGD (exact) or of the naive product (WEP) for the same "
         "problem: they differ from machine to machine and from call to call, and are the only figures that do",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=tuple(_claims()),

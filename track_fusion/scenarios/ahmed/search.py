@@ -24,7 +24,10 @@ from track_fusion.rules import RULES
 from track_fusion.rules.mixture_exact import MixtureExactParams
 from track_fusion.rules.mixture_wep import MixtureWepParams
 from track_fusion.study.chart import Chart, Contours, Series
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario, chosen
+from track_fusion.study.claims import Claim
+from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Scenario
 from track_fusion.tracks import StateLayout
 
 #: Text of 5.3 and caption of Fig. 9: divergence of robot 3's fused mixture from the centralised one.
@@ -132,7 +135,7 @@ def quotient(start: Mixture, local: Mapping[str, Mixture]) -> Array:
     return np.asarray(total - len(LINKS) * log_pdf(start, POINTS))
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Search with these jittered priors: per row the divergences, (R,), the mass near the target, and the density.
 
     Notes    Run by run: which components are cut and merged differs from run to run, so a batch saves no time, and
@@ -143,23 +146,23 @@ def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -
     return _run_by_run(lambda run, tell: _one_run(run, seed, list(rows), table, tell), runs, progress)
 
 
-def _run_by_run(one: Callable[[int, Progress], Samples], runs: Sequence[int], progress: Progress) -> Samples:
-    """Join the samples of single runs."""
+def _run_by_run(one: Callable[[int, Progress], Outcomes], runs: Sequence[int], progress: Progress) -> Outcomes:
+    """Join the outcomes of single runs."""
     found = []
     for done, run in enumerate(runs):
         found.append(one(run, partial(_share, progress, done, len(runs))))
-    return {name: np.concatenate([samples[name] for samples in found]) for name in found[0]}
+    return {name: np.concatenate([outcomes[name] for outcomes in found]) for name in found[0]}
 
 
 def _share(progress: Progress, done: int, count: int, share: float) -> None:
     progress((done + share) / count)
 
 
-def _one_run(run: int, seed: int, rows: Sequence[str], table: Mapping[str, RuleChoice], progress: Progress) -> Samples:
+def _one_run(run: int, seed: int, rows: Sequence[str], table: Mapping[str, RuleChoice], progress: Progress) -> Outcomes:
     start = prior([run], seed)
     centre, truth = log_pdf(_searched_by_all(start, progress), POINTS), bayes(start)
     local = _searched_by_each(start, progress) if set(rows) != {CENTRE} else {}
-    samples = {"prior": _thinned(log_pdf(start, POINTS)), "bayes": _thinned(truth)}
+    outcomes = {"prior": _thinned(log_pdf(start, POINTS)), "bayes": _thinned(truth)}
     for done, row in enumerate(rows):
         if row == CENTRE:
             density = centre
@@ -169,9 +172,9 @@ def _one_run(run: int, seed: int, rows: Sequence[str], table: Mapping[str, RuleC
             density = quotient(start, local)
         else:
             density = log_pdf(fused(table[row], start, local, seed), POINTS)
-        samples |= _measured(row, density, centre, truth)
+        outcomes |= _measured(row, density, centre, truth)
         progress(0.5 + 0.5 * (done + 1) / len(rows))
-    return samples
+    return outcomes
 
 
 def _searched_by_all(start: Mixture, progress: Progress) -> Mixture:
@@ -188,7 +191,7 @@ def _searched_by_each(start: Mixture, progress: Progress) -> dict[str, Mixture]:
     return found
 
 
-def _measured(row: str, density: Array, centre: Array, truth: Array) -> Samples:
+def _measured(row: str, density: Array, centre: Array, truth: Array) -> Outcomes:
     near = (POINTS**2).sum(-1) < NEAR_M**2
     found = {
         f"{row}/kld_from_bayes_nats": kl_on_grid(truth, density),
@@ -205,12 +208,12 @@ def _thinned(log_density: Array) -> Array:
     return np.swapaxes(on_grid, 1, 2)[:, ::2, ::2]
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Average the divergences and masses over the priors."""
-    return {name: Estimate.mean(values) for name, values in samples.items() if "/" in name}
+    return {name: Estimate.mean(values) for name, values in outcomes.items() if "/" in name}
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Divergence from the centralised mixture of robot 3's after fusion by any rule for peers, (R,) each.
 
     Raises
@@ -222,7 +225,7 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
     return _run_by_run(lambda run, tell: _compared(run, seed, rules, tell), runs, progress)
 
 
-def _compared(run: int, seed: int, rules: Sequence[RuleChoice], progress: Progress) -> Samples:
+def _compared(run: int, seed: int, rules: Sequence[RuleChoice], progress: Progress) -> Outcomes:
     start = prior([run], seed)
     centre = log_pdf(_searched_by_all(start, progress), POINTS)
     local, found = _searched_by_each(start, progress), {}
@@ -247,19 +250,19 @@ PANELS = {
 LEVELS = (0.05, 0.2, 0.4, 0.6, 0.8)
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Densities of the first run as contours, as Fig. 9, and the divergences of all rows."""
     side = (np.arange(0, GRID, 2) + 0.5) * 2.0 * HALF_GRID_M / GRID - HALF_GRID_M
     ways = _ways()
     panels = []
     for name, title in PANELS.items():
-        if name in samples:
-            z = samples[name][0]
+        if name in outcomes:
+            z = outcomes[name][0]
             levels = tuple(float(share * z.max()) for share in LEVELS)
             shown = ways if name == "prior" else ways[:1] if name in (ALONE,) else ()
             contours = (Contours("density", side, side, z, levels),)
             panels.append(Chart(title, "x, m", "y, m", shown, contours, equal=True))
-    estimates = {n.removesuffix("/kld_nats"): e for n, e in figures(samples).items() if n.endswith("/kld_nats")}
+    estimates = {n.removesuffix("/kld_nats"): e for n, e in figures(outcomes).items() if n.endswith("/kld_nats")}
     if not estimates:
         return panels
     at = np.arange(len(estimates), dtype=float)
@@ -339,7 +342,7 @@ SCENARIO = Scenario(
         "pairs of components whose quotient has no integral are left out",
         "the printed divergence belongs to the prior and ways of Fig. 9, a picture: its magnitude alone compares",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=CLAIMS,

@@ -11,7 +11,8 @@ from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.rules import RULES, FusedTracks, SourceTracks
-from track_fusion.study.scenario import Progress, RuleChoice, Samples, check_needs, chosen
+from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rule_choice import RuleChoice, check_needs
 
 PAPER = (
     "Li et al., Second Order Statistics Analysis and Comparison between Arithmetic and Geometric Average Fusion, 2019, "
@@ -23,14 +24,14 @@ PAPER = (
 
 def exact_samples(
     rows: Mapping[str, Callable[[], Mapping[str, float]]], runs: Sequence[int], progress: Progress, only: str
-) -> Samples:
+) -> Outcomes:
     """Work out the rows whose names start with `only`; every run has the same numbers, (R,) each.
 
     Parameters
     ----------
     rows : mapping    row name -> function that gives {quantity: value}
     """
-    found: Samples = {}
+    found: Outcomes = {}
     wanted = chosen(rows, only)
     for done, (row, measure) in enumerate(wanted.items(), 1):
         found |= {f"{row}/{quantity}": np.full(len(runs), float(value)) for quantity, value in measure().items()}
@@ -38,9 +39,9 @@ def exact_samples(
     return found
 
 
-def exact_figures(samples: Samples) -> dict[str, Estimate]:
+def exact_figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Figures of samples in which nothing is random."""
-    return {name: Estimate.exact(values[0]) for name, values in samples.items()}
+    return {name: Estimate.exact(values[0]) for name, values in outcomes.items()}
 
 
 def fuse(choice: RuleChoice, tracks: SourceTracks) -> FusedTracks:

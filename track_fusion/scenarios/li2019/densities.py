@@ -16,7 +16,10 @@ from track_fusion.rules.geometric_average import GeometricAverageParams
 from track_fusion.scenarios.li2019.averages import density_average, density_moments
 from track_fusion.scenarios.li2019.common import PAPER, exact_figures, exact_samples, fuse
 from track_fusion.study.chart import Chart, Contours, Series
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario
+from track_fusion.study.claims import Claim
+from track_fusion.study.rows import Outcomes, Progress
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Scenario
 
 #: Weights of the first density, the ends apart, and values of the parameter.
 WEIGHT = np.linspace(0.0, 1.0, 101)[1:-1]
@@ -161,12 +164,12 @@ def _rows() -> dict[str, Callable[[], Mapping[str, float]]]:
 ROWS = _rows()
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Work out the rows whose names start with `only`: their figures, (R,), the same in every run."""
     return exact_samples(ROWS, runs, progress, only)
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Root of the mean square error (3) of what any rules make of Figs. 5 and 6, averaged over the parameter, (R,)."""
 
     def errors(choice: RuleChoice) -> dict[str, float]:
@@ -188,12 +191,12 @@ LEVELS = (150.0, 200.0, 300.0, 400.0, 600.0)
 EXCESS_LEVELS = (-50.0, 0.0, 50.0, 100.0)
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Figs. 5 and 6: variances, mean square errors and their difference; Appendix B: the densities."""
     found = []
     for name, pair in PAIRS.items():
         title = f"Fig. {name[-1]}"
-        averages = [a for a in (AA, GA) if f"{a}@{name}/mean_1" in samples]
+        averages = [a for a in (AA, GA) if f"{a}@{name}/mean_1" in outcomes]
         if averages:
             found.append(_variance_chart(title, pair, averages))
             lines = tuple(_contours(a, pair.errors(a, CHART_WEIGHT, CHART_THETA), LEVELS) for a in averages)
@@ -205,7 +208,7 @@ def charts(samples: Samples) -> list[Chart]:
             levels = [level for level in EXCESS_LEVELS if excess.min() < level < excess.max()]
             levelled = tuple(Contours(f"{level:g}", inner, CHART_THETA, excess, (level,)) for level in levels)
             found.append(_plane(f"{title}: mean square error, arithmetic minus geometric", levelled))
-    if f"{GA}@appendix/mean_1" in samples:
+    if f"{GA}@appendix/mean_1" in outcomes:
         found.append(_appendix_chart())
     return found
 
@@ -343,7 +346,7 @@ SCENARIO = Scenario(
         "assumed: variances 100 and 100, or means 50 and 50, for Remark 7; means 50 and 80 for Remark 5",
         "printed means of Appendix B, 3 sqrt(2)/5 and 2 sqrt(2)/3, as decimals",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=exact_figures,
     charts=charts,
     claims=CLAIMS,

@@ -22,7 +22,10 @@ from track_fusion.scenarios.li2019.common import (
     scalar_mixture,
 )
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario
+from track_fusion.study.claims import Claim
+from track_fusion.study.rows import Outcomes, Progress
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Scenario
 
 #: GM 1 and GM 2, the second padded by a component of weight 0.
 PARTS = scalar_mixture(
@@ -95,12 +98,12 @@ def _rows() -> dict[str, Callable[[], Mapping[str, float]]]:
 ROWS = _rows()
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Fuse by the rows whose names start with `only`: their figures, (R,), the same in every run."""
     return exact_samples(ROWS, runs, progress, only)
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Divergence of the two sources from what any rules give, and of that from the sources, both averaged, (R,).
 
     Intensities are normalised. The arithmetic average has the least divergence of the sources from it, the exact
@@ -126,16 +129,16 @@ CHART_X = np.linspace(-30.0, 140.0, 341)
 VISIBLE = 0.002
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Fig. 7: the intensities, and the components of the geometric average."""
     lines = [Series(f"GM {k + 1}", CHART_X, intensity(PARTS.at(k), CHART_X), "dotted") for k in range(2)]
     for row, choice, label in ((AA, AVERAGE, "arithmetic"), (GA, HYBRID, "geometric")):
-        if f"{row}/peaks_1" in samples:
+        if f"{row}/peaks_1" in outcomes:
             lines.append(Series(label, CHART_X, intensity(fused_mixture(choice), CHART_X)))
-    if f"{EXACT}/peaks_1" in samples:
+    if f"{EXACT}/peaks_1" in outcomes:
         lines.append(Series("geometric, exact", CHART_X, np.interp(CHART_X, X, _exact()), "dashed"))
     found = [Chart("Fig. 7: averages at equal weights", "x", "targets per unit of x", tuple(lines))]
-    if f"{GA}/peaks_1" in samples:
+    if f"{GA}/peaks_1" in outcomes:
         found.append(_component_chart())
     return found
 
@@ -215,7 +218,7 @@ SCENARIO = Scenario(
         "isolated component, 28.3, beyond the targets and that component",
         "components are numbered by ascending mean",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=exact_figures,
     charts=charts,
     claims=CLAIMS,

@@ -24,7 +24,10 @@ from track_fusion.scenarios.li2019.common import (
     scalar_mixture,
 )
 from track_fusion.study.chart import Chart, Series, Style
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario, chosen, compare_each
+from track_fusion.study.claims import Claim
+from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rule_choice import RuleChoice, compare_each
+from track_fusion.study.scenario import Scenario
 
 TARGETS = np.array([20.0, 40.0, 70.0, 110.0, 200.0])
 SENSORS = 6
@@ -144,7 +147,7 @@ def _rows() -> dict[str, Fusion]:
 ROWS = _rows()
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Fuse trials by the rows whose names start with `only`.
 
     Returns
@@ -153,7 +156,7 @@ def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -
     with all sensors, row/missed: how many missed each, (R, 5); row/mixed: whether two became one, (R,)}
     """
     parts, seen = trials(runs, seed)
-    found: Samples = {}
+    found: Outcomes = {}
     wanted = chosen(ROWS, only)
     for done, (row, fusion) in enumerate(wanted.items(), 1):
         outcome = fusion(parts)
@@ -166,22 +169,22 @@ def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -
     return found
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Lost targets a trial, mass of false alarms; how often a target is lost that so many sensors missed."""
     found: dict[str, Estimate] = {}
     for row in ROWS:
-        if f"{row}/lost" not in samples:
+        if f"{row}/lost" not in outcomes:
             continue
-        lost = samples[f"{row}/lost"]
+        lost = outcomes[f"{row}/lost"]
         found[f"{row}/lost_targets_1"] = Estimate.mean(lost.sum(-1))
-        found[f"{row}/far_mass_1"] = Estimate.mean(samples[f"{row}/far"])
-        if f"{row}/missed" not in samples:
+        found[f"{row}/far_mass_1"] = Estimate.mean(outcomes[f"{row}/far"])
+        if f"{row}/missed" not in outcomes:
             continue
-        found[f"{row}/mixed_share_1"] = Estimate.mean(samples[f"{row}/mixed"])
+        found[f"{row}/mixed_share_1"] = Estimate.mean(outcomes[f"{row}/mixed"])
         for k, target in enumerate(TARGETS):
             found[f"{row}/lost_at_{target:.0f}_share_1"] = Estimate.mean(lost[:, k])
         for count in range(3):
-            found |= _lost_share(row, lost, samples[f"{row}/missed"] == count, count)
+            found |= _lost_share(row, lost, outcomes[f"{row}/missed"] == count, count)
     return found
 
 
@@ -193,11 +196,11 @@ def _lost_share(row: str, lost: Array, cases: NDArray[np.bool_], count: int) -> 
     return {f"{row}/lost_missed_by_{count}_share_1": Estimate.of_averages(both, lambda m: m[:, 0] / m[:, 1])}
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Lost targets and mass far from all targets of any rules, each scaled to the mean number of targets, (R,)."""
     parts, _ = trials(runs, seed)
 
-    def measure(choice: RuleChoice) -> Samples:
+    def measure(choice: RuleChoice) -> Outcomes:
         outcome = by_rule(choice)(parts)
         return {
             "lost_targets_1": (outcome.near < least_mass()).sum(-1).astype(float),
@@ -210,9 +213,9 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
 # Charts and claims.
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Fig. 8 for the first trial of seed 0; lost targets by the number of sensors and by target."""
-    measured = figures(samples)
+    measured = figures(outcomes)
     labels = {AA: "arithmetic", GA: "geometric", EXACT: "geometric, exact"}
     rows = {row: label for row, label in labels.items() if f"{row}/lost_targets_1" in measured}
     found = [_trial_chart(rows)] if rows else []
@@ -315,7 +318,7 @@ SCENARIO = Scenario(
         "@exact: without the approximation (49), point by point; @sensorsK: the first K of the six",
         "compare: what a rule gives is scaled to the sources' mean number of targets",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=CLAIMS,

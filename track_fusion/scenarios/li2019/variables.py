@@ -21,7 +21,9 @@ from track_fusion.scenarios.li2019.averages import (
 from track_fusion.scenarios.li2019.common import PAPER, exact_samples
 from track_fusion.scenarios.li2019.variable_pairs import MEAN, VARIANCES, Variables, normal_pair, poisson_pair
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.scenario import Claim, Progress, Samples, Scenario, chosen
+from track_fusion.study.claims import Claim
+from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.scenario import Scenario
 
 #: Pairs of variables drawn in one run: what fits the cache at all weights.
 PAIRS = 1000
@@ -106,12 +108,12 @@ EXACT: dict[str, Callable[[], dict[str, float]]] = {
 }
 
 
-# Samples and figures.
+# Outcomes and figures.
 
 ROWS = {f"{average}@{variant}": (average, variant) for variant in VARIABLES for average in AVERAGES}
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Draw pairs and average them at every weight.
 
     Returns
@@ -182,10 +184,10 @@ def _curves(variables: Variables) -> dict[str, Curve]:
     return found
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Least variance and mean square errors with their weights; at what share of weights the arithmetic has more."""
     found: dict[str, Estimate] = {}
-    for name, values in samples.items():
+    for name, values in outcomes.items():
         if values.ndim == 1:
             found[name] = Estimate.exact(values[0])
             continue
@@ -197,8 +199,8 @@ def figures(samples: Samples) -> dict[str, Estimate]:
         found[f"{name}/mean_half_1"] = Estimate.of_averages(values[:, 0, half], lambda m, o=origin: m + o)  # type: ignore[misc]
     for variant, variables in VARIABLES.items():
         rows = [f"{average}@{variant}" for average in AVERAGES]
-        if all(row in samples for row in rows):
-            found |= _comparison(rows[0], variables, np.stack([samples[row] for row in rows], 1))
+        if all(row in outcomes for row in rows):
+            found |= _comparison(rows[0], variables, np.stack([outcomes[row] for row in rows], 1))
     return found
 
 
@@ -217,7 +219,7 @@ def _comparison(row: str, variables: Variables, both: Array) -> dict[str, Estima
     return found
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Figs. 1 to 4: variance and mean square error over the weight of the first variable."""
     panels = [
         ("Fig. 1: variance, normal variables", [(v, "variance", VARIABLES[v].label) for v in FIGURE_1]),
@@ -231,12 +233,12 @@ def charts(samples: Samples) -> list[Chart]:
             Series(
                 f"{'geometric' if geometric else 'arithmetic'}, {label}",
                 WEIGHT,
-                _curves(VARIABLES[variant])[what](samples[f"{average}@{variant}"].mean(0)),
+                _curves(VARIABLES[variant])[what](outcomes[f"{average}@{variant}"].mean(0)),
                 "dashed" if geometric else "line",
             )
             for variant, what, label in lines
             for average, geometric in AVERAGES.items()
-            if f"{average}@{variant}" in samples
+            if f"{average}@{variant}" in outcomes
         )
         if series:
             found.append(Chart(title, "weight of variable 1", title.split(": ")[1].split(",")[0], series))
@@ -375,7 +377,7 @@ SCENARIO = Scenario(
         "the same normal deviates make the variables of all correlations, and both averages are taken of them",
         "least values by a parabola through the lowest of 51 weights and its neighbours",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=CLAIMS,

@@ -20,7 +20,10 @@ from track_fusion.rules.geometric_average import GeometricAverageParams
 from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
 from track_fusion.rules.naive import NaiveParams
 from track_fusion.study.chart import Chart, ellipse
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario, chosen, compare_each
+from track_fusion.study.claims import Claim
+from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rule_choice import RuleChoice, compare_each
+from track_fusion.study.scenario import Scenario
 
 #: The densities of Fig. 1 are not printed. This pair is assumed: trace-optimal covariance intersection gives it the
 #: paper's weight w1 = .3764.
@@ -96,7 +99,7 @@ def fused(row: str, choice: RuleChoice | None, seed: int, run: int) -> FusedTrac
     return RULES[choice.key](tracks, choice.params)
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Fuse by the rows whose names start with `only`.
 
     Returns
@@ -139,10 +142,10 @@ def modes(pairs: Mixture | None) -> Array:
     return np.asarray((rising[..., :-1] & ~rising[..., 1:]).sum(-1) + ~rising[..., 0] + rising[..., -1], np.float64)
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Trace and determinant by rule and case, the weight on track 1, and the modes of the mixture."""
     found = {}
-    for name, values in samples.items():
+    for name, values in outcomes.items():
         row, _, what = name.rpartition("/")
         for i, case in enumerate(SEPARATIONS):
             if what == "cov":
@@ -159,7 +162,7 @@ def _over_runs(row: str, values: Array) -> Estimate:
     return Estimate.mean(values) if draws(ROWS[row]) else Estimate.exact(values[0])
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Trace of the fused covariance by case, (R,), under any rules: what is claimed, which need not be true.
 
     Raises
@@ -167,29 +170,29 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
     ParameterError    a rule needs more than the tracks
     """
 
-    def measure(choice: RuleChoice) -> Samples:
+    def measure(choice: RuleChoice) -> Outcomes:
         traces = np.array([np.trace(fused("", choice, seed, r).cov, axis1=1, axis2=2) for r in runs])
         return {f"trace_case_{case}_m2": traces[:, i] for i, case in enumerate(SEPARATIONS)}
 
     return compare_each("given", rules, progress, measure)
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Ellipses of one standard deviation: the schemes of Fig. 1 in each case, then all other rules."""
     others = [f"given-{choice.name}" for choice in (*CHAIN, *OTHERS)]
     groups = [[f"given-{choice.name}" for choice in PAPER]]
     groups += [others[i : i + IN_A_PICTURE] for i in range(0, len(others), IN_A_PICTURE)]
-    pictures = [_picture(case, group, samples) for group in groups for case in SEPARATIONS]
+    pictures = [_picture(case, group, outcomes) for group in groups for case in SEPARATIONS]
     return [picture for picture in pictures if len(picture.series) > len(TRACKS)]
 
 
-def _picture(case: str, rows: Iterable[str], samples: Samples) -> Chart:
+def _picture(case: str, rows: Iterable[str], outcomes: Outcomes) -> Chart:
     at = list(SEPARATIONS).index(case)
     pair = two_tracks(SEPARATIONS[case])
     lines = [ellipse(f"P{i + 1}", pair.mean[i], pair.cov[i], 1.0, "dashed") for i in range(pair.count)]
     for row in rows:
-        if f"{row}/mean" in samples:
-            mean, cov = samples[f"{row}/mean"][0, at], samples[f"{row}/cov"][0, at]
+        if f"{row}/mean" in outcomes:
+            mean, cov = outcomes[f"{row}/mean"][0, at], outcomes[f"{row}/cov"][0, at]
             lines.append(ellipse(row.partition("-")[2], mean, cov, 1.0))
     title = f"({case}) means {SEPARATIONS[case]:g} m apart along x, one-sigma ellipses"
     return Chart(title, "x / m", "y / m", tuple(lines), equal=True)
@@ -273,7 +276,7 @@ SCENARIO = Scenario(
         "trace, rules that Fig. 1 does not show have their default parameters",
         "runs count only for the rules that sample, whose draws differ from run to run",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=_claims(),

@@ -20,6 +20,7 @@ from track_fusion.scenarios.li2022.claims import (
     union_claims,
     weight_claims,
 )
+from track_fusion.study.claims import Claim, Printed
 from track_fusion.study.one_target import (
     RULE_CHOICES,
     GaussianFilter,
@@ -30,7 +31,9 @@ from track_fusion.study.one_target import (
     sir_rows,
 )
 from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
-from track_fusion.study.scenario import Claim, Printed, RuleChoice, Scenario, Tracking
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Scenario
+from track_fusion.study.scene import Tracking
 from track_fusion.tracks import StateLayout
 
 #: Table II: ARMSE of position (m), velocity (m/s) and turn rate (deg/s). Of CKF-NF the text has "2 15.76".
@@ -176,7 +179,7 @@ SCENARIO = Scenario(
         "the transition uses the turn rate before the step; the process noise is block-diagonal; sigma_theta is "
         "positive; bearings by atan2, residuals wrapped",
     ),
-    sample=STUDY.sample,
+    simulate=STUDY.simulate,
     figures=STUDY.figures,
     charts=STUDY.charts,
     claims=_claims(),

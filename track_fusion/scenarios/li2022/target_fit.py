@@ -15,7 +15,10 @@ from track_fusion.metrics.accuracy import Estimate
 from track_fusion.rules import RULES, FusedTracks, SourceTracks
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario, chosen, compare_each
+from track_fusion.study.claims import Claim
+from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rule_choice import RuleChoice, compare_each
+from track_fusion.study.scenario import Scenario
 
 #: Section III-B: mean and variance of the densities and of the target in each case.
 DENSITIES = np.array([[40.0, 400.0], [50.0, 200.0], [60.0, 100.0], [100.0, 400.0]])
@@ -120,20 +123,20 @@ def mixed_divergence(weights: Array, case: str) -> float:
     return float(kl_on_grid(log_pdf(mixed, POINTS), log_pdf(target, POINTS)))
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Measure the rows whose names start with `only`, (R, ...) each; nothing is random."""
     wanted = chosen(rows(), only)
-    found: Samples = {}
+    found: Outcomes = {}
     for done, (name, row) in enumerate(wanted.items()):
         found |= {f"{name}/{what}": np.stack([np.asarray(value)] * len(runs)) for what, value in row.measure().items()}
         progress((done + 1) / len(wanted))
     return found
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Divergences, moments, and the weights where they are unique."""
     found = {}
-    for name, values in samples.items():
+    for name, values in outcomes.items():
         row, _, what = name.rpartition("/")
         if what != "weights":
             found[f"{name}_{'nats' if what.endswith('kld') else '1'}"] = Estimate.exact(values[0])
@@ -142,7 +145,7 @@ def figures(samples: Samples) -> dict[str, Estimate]:
     return found
 
 
-def compare(choices: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+def compare(choices: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Divergence of the fused Gaussian from the target by case, (R,), under any rules; nothing is random.
 
     Raises
@@ -150,7 +153,7 @@ def compare(choices: Sequence[RuleChoice], runs: Sequence[int], seed: int, progr
     ParameterError    a rule needs more than the densities and the target
     """
 
-    def measure(choice: RuleChoice) -> Samples:
+    def measure(choice: RuleChoice) -> Outcomes:
         fits = {case: fit(choice, case) for case in TARGETS}
         values = {case: divergence(fused.mean, fused.cov, case) for case, fused in fits.items()}
         return {f"kld_case_{case}_nats": np.full(len(runs), value) for case, value in values.items()}
@@ -158,24 +161,24 @@ def compare(choices: Sequence[RuleChoice], runs: Sequence[int], seed: int, progr
     return compare_each("given", choices, progress, measure, ("target",))
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """The densities, the target and the best fit, merged and not, in each case; then the weights."""
-    cases = [case for case in TARGETS if f"{best(case)}/weights" in samples]
+    cases = [case for case in TARGETS if f"{best(case)}/weights" in outcomes]
     numbers = np.arange(1.0, len(DENSITIES) + 1)
     bars = [
-        Series(f"case {case}", numbers, samples[f"{best(case)}/weights"][0], "bars")
+        Series(f"case {case}", numbers, outcomes[f"{best(case)}/weights"][0], "bars")
         for case in cases
         if case in WEIGHTS
     ]
     title, ticks = "Optimal weights (of case 1 they are not unique)", {float(n): f"f{n:g}" for n in numbers}
     weights = [Chart(title, "density", "weight", tuple(bars), ticks=ticks)] if bars else []
-    return [_densities(case, samples) for case in cases] + weights
+    return [_densities(case, outcomes) for case in cases] + weights
 
 
-def _densities(case: str, samples: Samples) -> Chart:
+def _densities(case: str, outcomes: Outcomes) -> Chart:
     x, target = POINTS[DRAWN], TARGETS[case]
     lines = [Series(f"f{i}", x[:, 0], _gaussian(x, *one), "dotted") for i, one in enumerate(DENSITIES, 1)]
-    mean, variance, weights = (samples[f"{best(case)}/{what}"][0] for what in ("mean", "variance", "weights"))
+    mean, variance, weights = (outcomes[f"{best(case)}/{what}"][0] for what in ("mean", "variance", "weights"))
     lines += [
         Series("target", x[:, 0], _gaussian(x, *target)),
         Series("best average, merged", x[:, 0], _gaussian(x, mean, variance), "dashed"),
@@ -251,7 +254,7 @@ SCENARIO = Scenario(
         "the exact variance of case 3 is 635.975: its print is one unit of the last digit off",
         "densities have no unit",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=_claims(),

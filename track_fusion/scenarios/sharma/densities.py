@@ -17,7 +17,8 @@ from track_fusion.random_streams import stream
 from track_fusion.rules import RULES, FusedTracks, SourceTracks
 from track_fusion.rules.geometric_mean_sampling import GeometricMeanSamplingParams
 from track_fusion.rules.harmonic_mean import HarmonicMeanParams
-from track_fusion.study.scenario import Progress, RuleChoice, Samples, check_needs, chosen
+from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rule_choice import RuleChoice, check_needs
 
 #: Weight of both densities in every fusion whose weights are not sought.
 HALF = (0.5, 0.5)
@@ -84,7 +85,7 @@ class Pair:
         mixture = fused.mixture or Mixture(np.ones(1), fused.mean[None], fused.cov[None])
         return float(kl_on_grid(self.exact, log_pdf(mixture, POINTS)))
 
-    def compare(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+    def compare(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
         """Fuse by any rules: divergence of the exact harmonic mean density from each result, (R,).
 
         Raises
@@ -92,8 +93,8 @@ class Pair:
         ParameterError    a rule needs more than the two densities
         """
         check_needs(rules)
-        samples = sample({f"given-{c.name}": self.by_rule(c) for c in rules}, runs, seed, progress)
-        return {name: values for name, values in samples.items() if name.endswith("/kld_nats")}
+        outcomes = simulate({f"given-{c.name}": self.by_rule(c) for c in rules}, runs, seed, progress)
+        return {name: values for name, values in outcomes.items() if name.endswith("/kld_nats")}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,7 +106,7 @@ class Row:
     random: bool = False
 
 
-def sample(rows: Mapping[str, Row], runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(rows: Mapping[str, Row], runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Fuse by each row whose name starts with `only`; a row that draws nothing, once for all runs.
 
     Returns
@@ -113,7 +114,7 @@ def sample(rows: Mapping[str, Row], runs: Sequence[int], seed: int, progress: Pr
     {row/mean: (R, 2), row/cov: (R, 2, 2), row/kld_nats: (R,)}, and for a mixture of M components row/weight
     (R, M), row/means (R, M, 2), row/covs (R, M, 2, 2)
     """
-    found: Samples = {}
+    found: Outcomes = {}
     rows = chosen(rows, only)
     for done, (name, row) in enumerate(rows.items()):
         which = runs if row.random else runs[:1]
@@ -124,7 +125,7 @@ def sample(rows: Mapping[str, Row], runs: Sequence[int], seed: int, progress: Pr
     return found
 
 
-def _columns(pair: Pair, fused: Sequence[FusedTracks]) -> Samples:
+def _columns(pair: Pair, fused: Sequence[FusedTracks]) -> Outcomes:
     """Put the results of several runs together."""
     columns = {
         "mean": np.stack([f.mean for f in fused]),
@@ -139,18 +140,18 @@ def _columns(pair: Pair, fused: Sequence[FusedTracks]) -> Samples:
     return columns
 
 
-def figures(rows: Mapping[str, Row], samples: Samples) -> dict[str, Estimate]:
+def figures(rows: Mapping[str, Row], outcomes: Outcomes) -> dict[str, Estimate]:
     """Mean, determinant of the covariance and divergence of every row sampled."""
     found = {}
     for name, row in rows.items():
-        if f"{name}/mean" not in samples:
+        if f"{name}/mean" not in outcomes:
             continue
-        mean, cov = samples[f"{name}/mean"], samples[f"{name}/cov"]
+        mean, cov = outcomes[f"{name}/mean"], outcomes[f"{name}/cov"]
         columns = {
             "determinant_1": np.linalg.det(cov),
             "mean_x_1": mean[:, 0],
             "mean_y_1": mean[:, 1],
-            "kld_nats": samples[f"{name}/kld_nats"],
+            "kld_nats": outcomes[f"{name}/kld_nats"],
         }
         for column, values in columns.items():
             found[f"{name}/{column}"] = Estimate.mean(values) if row.random else Estimate.exact(values[0])

@@ -18,7 +18,10 @@ from track_fusion.rules.naive import NaiveParams
 from track_fusion.scenarios.sharma import densities as shared
 from track_fusion.scenarios.sharma.densities import COVS, GMD_S, HALF, HMD_GA, HMD_S, SAMPLES, Pair, Row
 from track_fusion.study.chart import Chart, Series, ellipse
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario
+from track_fusion.study.claims import Claim
+from track_fusion.study.rows import Outcomes, Progress
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Scenario
 
 #: (75)-(76).
 MEANS = np.array([[0.5, 1.0], [2.0, 1.0]])
@@ -70,15 +73,15 @@ ROWS = _rows()
 LEAST_ALPHA = "given-harmonic_mean@grid/least_alpha_1"
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Fuse (75)-(76) by the rows whose names start with `only`; see sharma_densities."""
-    return shared.sample(ROWS, runs, seed, progress, only)
+    return shared.simulate(ROWS, runs, seed, progress, only)
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Moments, determinant and divergence of each row; the least alpha that exceeds the geometric mean."""
-    found = shared.figures(ROWS, samples)
-    if "given-harmonic_mean@grid/mean" in samples:
+    found = shared.figures(ROWS, outcomes)
+    if "given-harmonic_mean@grid/mean" in outcomes:
         found[LEAST_ALPHA] = Estimate.exact(least_alpha())
     return found
 
@@ -95,9 +98,9 @@ def least_alpha() -> float:
     return float(brentq(lambda alpha: determinant(alpha) - wanted, 1.0, 2.0, xtol=1e-6))
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Fig. 1a and 1b, and the determinants behind them."""
-    measured = figures(samples)
+    measured = figures(outcomes)
     sources = tuple(ellipse(f"p{i + 1}", MEANS[i], COVS[i], style="dashed") for i in range(2))
     fused = {
         "GMD = CI": "given-covariance_intersection", "GMD-S": "given-geometric_mean_sampling",
@@ -107,9 +110,9 @@ def charts(samples: Samples) -> list[Chart]:
     inflated = {"GMD = CI": fused["GMD = CI"], "HMD-S, alpha 1": fused["HMD-S"]}
     inflated |= {f"HMD-S, alpha {a:g}": f"given-{_inflated(a).name}" for a in ALPHAS}
     found = [
-        Chart(f"86.5 % regions: {title}", "x", "y", (*sources, *_ellipses(samples, rows)), equal=True)
+        Chart(f"86.5 % regions: {title}", "x", "y", (*sources, *_ellipses(outcomes, rows)), equal=True)
         for title, rows in (("the fusions (sampling: one run)", fused), ("inflation (one run)", inflated))
-        if any(f"{row}/mean" in samples for row in rows.values())
+        if any(f"{row}/mean" in outcomes for row in rows.values())
     ]
     found.append(_bars(measured))
     if LEAST_ALPHA in measured:
@@ -133,16 +136,16 @@ def _bars(measured: dict[str, Estimate]) -> Chart:
     )
 
 
-def _ellipses(samples: Samples, rows: dict[str, str]) -> list[Series]:
+def _ellipses(outcomes: Outcomes, rows: dict[str, str]) -> list[Series]:
     return [
         ellipse(
             label,
-            samples[f"{row}/mean"][0],
-            samples[f"{row}/cov"][0],
+            outcomes[f"{row}/mean"][0],
+            outcomes[f"{row}/cov"][0],
             style="dotted" if label in ("GMD-S", "HMD-S") else "line",
         )
         for label, row in rows.items()
-        if f"{row}/mean" in samples
+        if f"{row}/mean" in outcomes
     ]
 
 
@@ -184,7 +187,7 @@ SCENARIO = Scenario(
         "divergence: of the exact harmonic mean density from the Gaussian with the fused moments",
         "the relative times of Table 1 are no figures, since times do not repeat: python -m benchmark --only rules",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=(

@@ -27,7 +27,10 @@ from track_fusion.scenarios.sharma.radar_runs import (
     tracked,
 )
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario, check_needs, chosen
+from track_fusion.study.claims import Claim
+from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rule_choice import RuleChoice, check_needs
+from track_fusion.study.scenario import Scenario
 
 #: Fusions from this time on count: before it tracks are still starting.
 SETTLED_S = 60.0
@@ -37,7 +40,7 @@ FIELD, ALONE = "given-field_of_view", "pda-alone"
 PAPER_ROWS = tuple(f"pda-{rule}" for rule in (CI, ICI, HMD))
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Run the rows whose names start with `only`: radars alone, and each rule.
 
     Returns
@@ -66,23 +69,23 @@ class Record(NamedTuple):
         return Record(square, score, variance, self.false[:, since:])
 
 
-def records(samples: Samples) -> dict[str, Record]:
+def records(outcomes: Outcomes) -> dict[str, Record]:
     """Return the record of each row."""
-    truth = scene().truth(0, 0)[FUSION_SCANS::FUSION_SCANS][..., list(LAYOUT.position)]
-    rows = [name.removesuffix("/nees") for name in samples if name.endswith("/nees")]
+    truth = scene().states(0, 0)[FUSION_SCANS::FUSION_SCANS][..., list(LAYOUT.position)]
+    rows = [name.removesuffix("/nees") for name in outcomes if name.endswith("/nees")]
     found = {}
     for row in rows:
-        position, score, variance, false = (samples[f"{row}/{column}"] for column in COLUMNS)
+        position, score, variance, false = (outcomes[f"{row}/{column}"] for column in COLUMNS)
         found[row] = Record(((position - truth) ** 2).sum(-1), score, variance, false)
     return found
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Error, NEES, claimed error and share of lost tracks by category, from SETTLED_S on; false tracks at a time."""
     found: dict[str, Estimate] = {}
-    if f"{FIELD}/radars" in samples:
+    if f"{FIELD}/radars" in outcomes:
         found |= {f"{FIELD}/category_{c}_targets_1": Estimate.exact(len(category(c))) for c in CATEGORIES}
-    table = records(samples)
+    table = records(outcomes)
     for row, record in table.items():
         for c in CATEGORIES:
             found |= {f"{row}/category_{c}_{name}": e for name, e in _figures_of(record, category(c)).items()}
@@ -130,11 +133,11 @@ def _share_of_least(table: Mapping[str, Record], targets: NDArray[np.intp]) -> E
     )
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """The map (Fig. 8), and error and NEES over time by category (Figs. 9-27 are such plots of each target)."""
-    table, found = records(samples), []
-    if f"pda-{HMD}/position" in samples:
-        found.append(_map(samples[f"pda-{HMD}/position"][0]))
+    table, found = records(outcomes), []
+    if f"pda-{HMD}/position" in outcomes:
+        found.append(_map(outcomes[f"pda-{HMD}/position"][0]))
     for c in CATEGORIES if table else ():
         parts = {_label(row): record.of(category(c)) for row, record in table.items()}
         errors = [Series(row, FUSION_TIMES_S, np.sqrt(_over_time(part.square))) for row, part in parts.items()]
@@ -163,7 +166,7 @@ def _map(position: Array) -> Chart:
     for name, radar in scene().radars.items():
         ring = np.array(radar.sensor.location) + radar.reach_m * np.stack([np.cos(angle), np.sin(angle)], -1)
         lines.append(Series(f"reach of {name.replace('_', ' ')}", ring[:, 0] / 1e3, ring[:, 1] / 1e3, "dashed"))
-    course = scene().truth(0, 0)[:: 2 * FUSION_SCANS, :, :2]
+    course = scene().states(0, 0)[:: 2 * FUSION_SCANS, :, :2]
     broken = np.concatenate([course, np.full((1, *course.shape[1:]), np.nan)]).swapaxes(0, 1).reshape(-1, 2)
     lines.append(Series("targets", np.nan_to_num(broken[:, 0]) / 1e3, broken[:, 1] / 1e3))
     dots = position[np.isfinite(position[..., 0])]
@@ -171,7 +174,7 @@ def _map(position: Array) -> Chart:
     return Chart("Radars and targets", "east of radar 1, km", "north of radar 1, km", tuple(lines), equal=True)
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Fuse the same tracks by any rules: error of the tracks found, and share of lost ones, over all targets judged.
 
     Returns
@@ -185,7 +188,7 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
     check_needs(rules)
     table = records(tracked({f"pda-{choice.name}": choice for choice in rules}, runs, seed, progress))
     targets = np.concatenate([category(c) for c in CATEGORIES])
-    found: Samples = {}
+    found: Outcomes = {}
     for row, record in table.items():
         part = record.of(targets, SETTLED)
         there = np.isfinite(part.nees)
@@ -277,7 +280,7 @@ SCENARIO = Scenario(
         "an error; figures from 60 s on, targets and times pooled",
         "nearest radar alone: for each target the track of the radar nearest to it",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=CLAIMS,

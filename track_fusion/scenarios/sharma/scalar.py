@@ -16,7 +16,10 @@ from track_fusion.rules.covariance_intersection import CovarianceIntersectionPar
 from track_fusion.rules.harmonic_mean import HarmonicMeanParams
 from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario, chosen, compare_each, fuse_runs
+from track_fusion.study.claims import Claim
+from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rule_choice import RuleChoice, compare_each, fuse_runs
+from track_fusion.study.scenario import Scenario
 
 STEPS = 100
 
@@ -76,7 +79,7 @@ def fuse(
     choice: RuleChoice, mean: Array, variance: Array, rngs: Generators | None = None
 ) -> tuple[Array, Array, Array]:
     """Fuse scalar tracks, mean and variance (R, 2): mean, variance and weight omega (R,), NaN where it has none."""
-    fused = fuse_runs(RULES[choice.key], choice.params, mean[..., None], variance[..., None, None], rngs)
+    fused = fuse_runs(choice, mean[..., None], variance[..., None, None], rngs)
     weight = np.full(len(mean), np.nan) if fused.weights is None else fused.weights[:, 0]
     return fused.mean[:, 0], fused.cov[:, 0, 0], weight
 
@@ -132,7 +135,7 @@ def _rows() -> dict[str, Row]:
 ROWS = _rows()
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Run the rows whose names start with `only`.
 
     Returns
@@ -141,7 +144,7 @@ def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -
     """
     rows: dict[str, Row | Pair] = chosen({**ROWS, **PAIRS}, only)
     normals = _normals(runs, seed)
-    found: Samples = {}
+    found: Outcomes = {}
     for done, (name, row) in enumerate(rows.items()):
         if isinstance(row, Pair):
             found[f"{name}/nees"] = _pair_nees(row, runs, seed)
@@ -166,10 +169,10 @@ def _pair_nees(pair: Pair, runs: Sequence[int], seed: int) -> Array:
     return np.asarray((mean**2 / variance).reshape(len(runs), DRAWS).mean(1))
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Weight, averaged over steps and runs; root-mean-square error, averaged over steps; NEES."""
     found = {}
-    for name, values in samples.items():
+    for name, values in outcomes.items():
         row, _, column = name.rpartition("/")
         if column == "square":
             found[f"{row}/armse_1"] = armse(values)
@@ -178,7 +181,7 @@ def figures(samples: Samples) -> dict[str, Estimate]:
     return found
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Fig. 3 for each ratio of the noises: weights over the steps, averaged over runs; error and NEES by setting."""
     found = []
     for ratio in dict.fromkeys(s.ratio for s in SETTINGS):
@@ -187,11 +190,11 @@ def charts(samples: Samples) -> list[Chart]:
             for choice in RULE_CHOICES:
                 name = f"kf-{choice.name}@{setting.name}/weight"
                 # Where all correlations give the same line, one is enough.
-                if name in samples and (choice.key == "harmonic_mean" or setting.correlation == 0.0):
-                    lines.append(_weights(choice, setting, samples[name]))
+                if name in outcomes and (choice.key == "harmonic_mean" or setting.correlation == 0.0):
+                    lines.append(_weights(choice, setting, outcomes[name]))
         if lines:
             found.append(Chart(f"Weights of the prior, q = {ratio:g} r", "step", "weight omega", tuple(lines)))
-    return found + _bars(samples)
+    return found + _bars(outcomes)
 
 
 def _weights(choice: RuleChoice, setting: Setting, values: Array) -> Series:
@@ -200,9 +203,9 @@ def _weights(choice: RuleChoice, setting: Setting, values: Array) -> Series:
     return Series(label, np.arange(1.0, values.shape[1] + 1), values.mean(0), "line" if harmonic else "dashed")
 
 
-def _bars(samples: Samples) -> list[Chart]:
+def _bars(outcomes: Outcomes) -> list[Chart]:
     """NEES of HMD-GA by setting."""
-    measured = figures(samples)
+    measured = figures(outcomes)
     bars = {n.rpartition("@")[2].removesuffix("/nees_1"): e for n, e in measured.items()
             if n.endswith("/nees_1") and "harmonic_mean" in n}  # fmt: skip
     if not bars:
@@ -217,7 +220,7 @@ def _bars(samples: Samples) -> list[Chart]:
     return [Chart("HMD-GA: squared error over the claimed variance", "", "NEES", lines, ticks=ticks)]
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Run any rules in every setting: root of the squared error averaged over the steps, (R,).
 
     Raises
@@ -226,7 +229,7 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
     """
     normals = _normals(runs, seed)
 
-    def measure(choice: RuleChoice) -> Samples:
+    def measure(choice: RuleChoice) -> Outcomes:
         found = {}
         for setting in SETTINGS:
             rngs = [stream(seed, run, "rule") for run in runs]
@@ -308,7 +311,7 @@ SCENARIO = Scenario(
         "the average weight 0.2 is read off a figure at unknown noise: judged as a claim, not as a figure",
         "given pairs: two consistent tracks of variances 1 and 10 whose errors are correlated, 400 pairs a run",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=CLAIMS,
