@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from track_fusion.densities.mixture.mixture import Mixture as Mixture
+from track_fusion.densities.mixture.mixture import gaussian, moments
 from track_fusion.linalg import Array, asymmetric, is_positive_definite, symmetrise
 from track_fusion.params import Params
 
@@ -39,6 +40,11 @@ class SourceTracks:
     mixture: Mixture | None = None
     extras: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
+    @classmethod
+    def of(cls, densities: Mixture, **extras: Any) -> SourceTracks:
+        """Make tracks of K mixtures (..., K, C); those of one component are Gaussian tracks."""
+        return cls(*moments(densities), mixture=densities if densities.count > 1 else None, extras=extras)
+
     @property
     def count(self) -> int:
         """Number of sources K."""
@@ -63,6 +69,11 @@ class FusedTracks:
     dof: Array | None = None
     mixture: Mixture | None = None
     info: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def density(self) -> Mixture:
+        """The fused mixture, or the Gaussian of the moments, of one component."""
+        return gaussian(self.mean, self.cov) if self.mixture is None else self.mixture
 
 
 @dataclasses.dataclass(frozen=True)

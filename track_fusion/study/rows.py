@@ -51,12 +51,18 @@ def run_by_run(runs: Sequence[int], progress: Progress, one: Callable[[int, Prog
 
 
 def exact_rows(
-    rows: Mapping[str, Callable[[], Mapping[str, Any]]], runs: Sequence[int], progress: Progress
+    rows: Mapping[str, Callable[[], Mapping[str, Any]]],
+    runs: Sequence[int],
+    seed: int,
+    progress: Progress,
+    only: str = "",
 ) -> Outcomes:
-    """Work out rows in which nothing is random: every run has the same numbers."""
-    return row_by_row(
-        rows, progress, lambda work_out: {name: np.array([value] * len(runs)) for name, value in work_out().items()}
-    )
+    """Work out the rows whose names start with `only`, in which nothing is random: every run has the same numbers."""
+
+    def repeated(work_out: Callable[[], Mapping[str, Any]]) -> Outcomes:
+        return {quantity: np.array([value] * len(runs)) for quantity, value in work_out().items()}
+
+    return row_by_row(chosen(rows, only), progress, repeated)
 
 
 def exact_figures(outcomes: Outcomes) -> dict[str, Estimate]:

@@ -32,6 +32,11 @@ class RuleChoice:
         """The rule itself."""
         return RULES[self.key]
 
+    @property
+    def random(self) -> bool:
+        """Whether the rule samples, so that each run has a result of its own."""
+        return self.rule.uses("seed", self.params)
+
     def fuse(self, tracks: SourceTracks) -> FusedTracks:
         """Fuse tracks that are known to be sound."""
         return self.rule.fuse(tracks, self.params)
@@ -67,7 +72,7 @@ def fuse_runs(
         return FusedTracks(matvec(transpose(fused.mean), mean.reshape(runs, -1)), fused.cov[:1], weights)
     dofs = np.full((runs, count), dof) if math.isfinite(dof) else None
     tracks = SourceTracks(mean, np.broadcast_to(cov, (runs, count, n, n)), dofs)
-    if rngs is None or not choice.rule.uses("seed", choice.params):
+    if rngs is None or not choice.random:
         return choice.fuse(tracks)
     each = [choice.fuse(_one_run(tracks, r, rng)) for r, rng in enumerate(rngs)]
     weighed = [f.weights for f in each if f.weights is not None]

@@ -58,6 +58,12 @@ class Mixture:
         )
 
 
+def gaussian(mean: Array, cov: Array) -> Mixture:
+    """Return a Gaussian as a mixture (..., 1), cov (..., n, n) broadcast to mean (..., n)."""
+    cov = np.broadcast_to(cov, (*mean.shape, mean.shape[-1]))
+    return Mixture(np.ones((*mean.shape[:-1], 1)), mean[..., None, :], cov[..., None, :, :])
+
+
 def moments(mixture: Mixture) -> tuple[Array, Array]:
     """Mean (..., n) and covariance (..., n, n) of each mixture, its weights normalised first."""
     part = mixture.normalised
@@ -233,14 +239,13 @@ def padded(mixture: Mixture, count: int) -> Mixture:
     return Mixture(weight, mixture.mean[..., at, :], mixture.cov[..., at, :, :])
 
 
-def stacked(one: Mixture, other: Mixture) -> Mixture:
-    """Stack two mixtures (..., C1) and (..., C2) as sources (..., 2, C), the smaller padded."""
-    count = max(one.count, other.count)
-    pair = padded(one, count), padded(other, count)
+def stacked(*mixtures: Mixture) -> Mixture:
+    """Stack K mixtures (..., C_k) as sources (..., K, C), the smaller padded."""
+    each = [padded(mixture, max(m.count for m in mixtures)) for mixture in mixtures]
     return Mixture(
-        np.stack([m.weight for m in pair], -2),
-        np.stack([m.mean for m in pair], -3),
-        np.stack([m.cov for m in pair], -4),
+        np.stack([m.weight for m in each], -2),
+        np.stack([m.mean for m in each], -3),
+        np.stack([m.cov for m in each], -4),
     )
 
 

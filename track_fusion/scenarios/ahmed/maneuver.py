@@ -13,6 +13,7 @@ from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate, rmse
 from track_fusion.peers.peer import Fuse, Peer
 from track_fusion.rules.mixture_wep import MixtureWepParams
+from track_fusion.scenarios.ahmed import PAPER
 from track_fusion.scenarios.ahmed.platforms import (
     COMPONENTS,
     PLATFORMS,
@@ -364,9 +365,8 @@ CLAIMS = (
 SCENARIO = Scenario(
     key="ahmed-maneuver",
     title="A manoeuvring target, three platforms that see ranges and talk once a minute around a ring",
-    paper="Ahmed, Decentralized Gaussian Mixture Fusion through Unified Quotient Approximations, 5.4",
+    paper=f"{PAPER}, 5.4",
     shows="what the weighted exponential product keeps of mixtures far from Gaussian when sampled (IGS) and by FOCI",
-    published={},
     published_runs=50,
     default_runs=5,
     publication_runs=10,

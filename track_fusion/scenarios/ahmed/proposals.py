@@ -31,6 +31,7 @@ from track_fusion.metrics.accuracy import Estimate
 from track_fusion.params import from_dict
 from track_fusion.random_streams import stream
 from track_fusion.rules import RULES
+from track_fusion.scenarios.ahmed import PAPER
 from track_fusion.scenarios.ahmed.mixtures import (
     CELL_AREA,
     GRID,
@@ -42,7 +43,7 @@ from track_fusion.scenarios.ahmed.mixtures import (
 )
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.claims import Claim, Printed
-from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rows import Outcomes, Progress, chosen, run_by_run
 from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.study.scenario import Scenario
 
@@ -147,14 +148,15 @@ def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "")
     {row/quantity: (R,)}, and row/mixands (R, M): shares of effective samples, or of bound: logarithms of the bounds
     beside the true weights; row/density, row/truth (R, P, P) for pictures
     """
-    rows, found = chosen(ROWS, only), dict[str, list[Any]]()
-    for at, run in enumerate(runs):
+    rows = chosen(ROWS, only)
+
+    def one(run: int, tell: Progress) -> dict[str, Any]:
         case = Case(seed, run)
-        for name, row in rows.items():
-            for quantity, value in case.measure(row).items():
-                found.setdefault(f"{name}/{quantity}", []).append(value)
-        progress((at + 1) / len(runs))
-    return {name: np.array(values) for name, values in found.items()}
+        values = {f"{name}/{q}": value for name, row in rows.items() for q, value in case.measure(row).items()}
+        tell(1.0)
+        return values
+
+    return run_by_run(runs, progress, one)
 
 
 def _row(variant: str, quantity: str) -> str:
@@ -163,17 +165,17 @@ def _row(variant: str, quantity: str) -> str:
 
 def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Medians of divergences and of looseness over the problems, means of all else; comparisons of the proposals."""
-    found = {}
+    measured = {}
     for name, values in outcomes.items():
         if values.ndim == 1:
             average = Estimate.median if name.endswith("_nats") else Estimate.mean
-            found[name] = average(values)
+            measured[name] = average(values)
     ess = {proposal: outcomes.get(_row(proposal, "mixands")) for proposal in PROPOSALS}
     naive, local, heavy = ess.values()
     if naive is not None and local is not None and heavy is not None:
-        found[_row("ingis", "beaten_1")] = Estimate.mean((np.maximum(local, heavy) > naive).mean(1))
-        found[_row("heavy_tail", "below_lagis_1")] = Estimate.mean((heavy < local).mean(1))
-    return found
+        measured[_row("ingis", "beaten_1")] = Estimate.mean((np.maximum(local, heavy) > naive).mean(1))
+        measured[_row("heavy_tail", "below_lagis_1")] = Estimate.mean((heavy < local).mean(1))
+    return measured
 
 
 def charts(outcomes: Outcomes) -> list[Chart]:
@@ -266,10 +268,9 @@ CLAIMS = (
 SCENARIO = Scenario(
     key="ahmed-proposals",
     title="What the mixands of a quotient of mixtures are sampled from",
-    paper="Ahmed, Decentralized Gaussian Mixture Fusion through Unified Quotient Approximations, 5.2",
+    paper=f"{PAPER}, 5.2",
     shows="how many of its samples each proposal makes effective, and how tight the bound on a mixand's weight is",
     published={f"{row}/kld_nats": value for row, value in FIGURE_7.items()},
-    published_runs=1,
     default_runs=200,
     publication_runs=500,
     assumptions=(

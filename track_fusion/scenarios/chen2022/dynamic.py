@@ -29,6 +29,7 @@ from track_fusion.rules.geodesic_projection import GeodesicProjectionParams
 from track_fusion.rules.mhdp_explicit import MhdpExplicitParams
 from track_fusion.rules.mhdp_iterative import MhdpIterativeParams
 from track_fusion.rules.quasi_minimal_manhattan import QuasiMinimalManhattanParams
+from track_fusion.scenarios.chen2022 import PAPER
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.claims import Claim
 from track_fusion.study.rows import Outcomes, Progress, chosen
@@ -274,7 +275,7 @@ def scenario(key: str, title: str, base: Tracking, table: Mapping[str, Sequence[
     return Scenario(
         key=key,
         title=title,
-        paper="Chen and Zhou, Multisensor Estimation Fusion on Statistical Manifold, 5.2",
+        paper=f"{PAPER}, 5.2",
         shows="rules that see heavy-tailed densities beside rules that see moments, when outliers disturb motion and "
         "measurements and the fused posterior is fed back to robust filters",
         published={

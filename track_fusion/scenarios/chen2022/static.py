@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -12,7 +13,7 @@ from track_fusion.densities.elliptical.elliptical import Family, generalized_gau
 from track_fusion.densities.elliptical.rao import informative_barycenter, rao_distance_scalar, scalar_geodesic
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.rules import RULES, SourceTracks
+from track_fusion.rules import SourceTracks
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.elliptical_tracks import EllipticalParams
 from track_fusion.rules.fast_covariance_intersection import FastCovarianceIntersectionParams
@@ -20,9 +21,10 @@ from track_fusion.rules.geodesic_projection import GeodesicProjectionParams
 from track_fusion.rules.mhdp_explicit import MhdpExplicitParams
 from track_fusion.rules.mhdp_iterative import MhdpIterativeParams
 from track_fusion.rules.quasi_minimal_manhattan import QuasiMinimalManhattanParams
+from track_fusion.scenarios.chen2022 import PAPER
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.claims import Claim
-from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rows import Outcomes, Progress, exact_rows
 from track_fusion.study.rule_choice import RuleChoice, compare_each
 from track_fusion.study.scenario import Scenario
 
@@ -63,7 +65,7 @@ class Setting:
         params = choice.params
         if isinstance(params, EllipticalParams) and params.family != "gaussian" and self.dof is None:
             params = dataclasses.replace(params, family="generalized_gaussian", beta=self.beta)
-        fused = RULES[choice.key].fuse(self.tracks, params)
+        fused = choice.rule.fuse(self.tracks, params)
         return np.array([fused.mean[0], fused.cov[0, 0] / self.family.kappa])
 
     def from_barycenter(self, fused: Array) -> float:
@@ -113,22 +115,24 @@ ROWS = {row_name(choice, name): (choice, setting) for name, setting in SETTINGS.
 
 
 def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
-    """Fuse by the rows whose names start with `only`: mean and scatter, (R, 2); nothing is random."""
-    rows, found = chosen(ROWS, only), {}
-    for done, (row, (choice, setting)) in enumerate(rows.items()):
-        found[row] = np.tile(setting.fuse(choice), (len(runs), 1))
-        progress((done + 1) / len(rows))
-    return found
+    """Fuse by the rows whose names start with `only`: {row/fused: mean and scatter, (R, 2)}; nothing is random."""
+    rows = {name: partial(_fused, *row) for name, row in ROWS.items()}
+    return exact_rows(rows, runs, seed, progress, only)
+
+
+def _fused(choice: RuleChoice, setting: Setting) -> dict[str, Array]:
+    return {"fused": setting.fuse(choice)}
 
 
 def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Rao distances from the barycenter and from the geodesic, names like given-mhdp_explicit@t3/rao_distance_1."""
-    found = {}
-    for row, fused in outcomes.items():
+    measured = {}
+    for name, fused in outcomes.items():
+        row = name.removesuffix("/fused")
         setting = ROWS[row][1]
-        found[f"{row}/rao_distance_1"] = Estimate.exact(setting.from_barycenter(fused[0]))
-        found[f"{row}/geodesic_distance_1"] = Estimate.exact(setting.from_geodesic(fused[0]))
-    return found
+        measured[f"{row}/rao_distance_1"] = Estimate.exact(setting.from_barycenter(fused[0]))
+        measured[f"{row}/geodesic_distance_1"] = Estimate.exact(setting.from_geodesic(fused[0]))
+    return measured
 
 
 def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
@@ -158,7 +162,7 @@ def charts(outcomes: Outcomes) -> list[Chart]:
             bars.append(Series(choice.name, places, np.array(values), "bars"))
     ticks = dict(zip(places.tolist(), (setting.title for setting in SETTINGS.values()), strict=True))
     title = "Rao distance of the fused density from the informative barycenter"
-    planes = [_plane(name, outcomes) for name in DRAWN if any(row_name(c, name) in outcomes for c in RULE_CHOICES)]
+    planes = [_plane(s, outcomes) for s in DRAWN if any(f"{row_name(c, s)}/fused" in outcomes for c in RULE_CHOICES)]
     return [Chart(title, "family of both estimates", "Rao distance", tuple(bars), ticks=ticks), *planes]
 
 
@@ -172,7 +176,7 @@ def _plane(name: str, outcomes: Outcomes) -> Chart:
         Series("informative barycenter", centre[:1], centre[1:], "points"),
     ]
     for choice in (*OTHERS, MHDP_E):
-        fused = outcomes.get(row_name(choice, name))
+        fused = outcomes.get(f"{row_name(choice, name)}/fused")
         if fused is not None:
             lines.append(Series(choice.name, fused[:1, 0], fused[:1, 1], "points"))
     return Chart(f"{setting.title}: fused densities", "mean", "scatter", tuple(lines))
@@ -213,12 +217,8 @@ CLAIMS = (
 SCENARIO = Scenario(
     key="chen2022-static",
     title="Two estimates of a number from one heavy-tailed family",
-    paper="Chen and Zhou, Multisensor Estimation Fusion on Statistical Manifold, 5.1",
+    paper=f"{PAPER}, 5.1",
     shows="how near each rule comes to the midpoint of the geodesic between two densities, at six weights of the tails",
-    published={},  # Fig. 2 prints no number
-    published_runs=1,
-    default_runs=1,
-    publication_runs=1,
     assumptions=(
         "5 and 7 are scatters; rules for Gaussians see kappa times them, and what is fused is divided by kappa",
         "GP takes the tracks for Gaussian; FCI is the exact half-way point; DCI minimises the determinant, KLA weighs "

@@ -11,6 +11,7 @@ from track_fusion.linalg import Array
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.rules import FusedTracks
+from track_fusion.scenarios.li2022 import PAPER
 from track_fusion.scenarios.li2022.claims import (
     ASSUMPTIONS,
     AVERAGE,
@@ -176,7 +177,7 @@ def _claims() -> tuple[Claim, ...]:
 SCENARIO = Scenario(
     key="li2022-linear",
     title="Two position sensors, one target, linear and Gaussian",
-    paper="Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average Density Fusion, IV-A",
+    paper=f"{PAPER}, IV-A",
     shows="what fusing with unknown correlation costs and gains when the fused posterior is fed back to both filters",
     published=published(TABLE_1, QUANTITIES) | SECTION_4A,
     published_runs=100,

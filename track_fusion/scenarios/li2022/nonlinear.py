@@ -7,6 +7,7 @@ import numpy as np
 from track_fusion.filters import cubature
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
+from track_fusion.scenarios.li2022 import PAPER
 from track_fusion.scenarios.li2022.claims import (
     ASSUMPTIONS,
     AVERAGE,
@@ -168,7 +169,7 @@ def _claims() -> tuple[Claim, ...]:
 SCENARIO = Scenario(
     key="li2022-nonlinear",
     title="Two range-bearing sensors, one turning target",
-    paper="Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average Density Fusion, IV-B",
+    paper=f"{PAPER}, IV-B",
     shows="cubature and particle filters under fusion with feedback; how naive fusion loses the target",
     published=published(TABLE_2, QUANTITIES) | SECTION_4B,
     published_runs=100,

@@ -9,15 +9,15 @@ from functools import cached_property
 import numpy as np
 
 from track_fusion.densities.mixture.mean_density import Kind, log_mean_density
-from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments
+from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.densities.on_grid import grid, kl_on_grid, moments_on_grid
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.random_streams import stream
-from track_fusion.rules import RULES, FusedTracks, SourceTracks
+from track_fusion.rules import FusedTracks, SourceTracks
 from track_fusion.rules.geometric_mean_sampling import GeometricMeanSamplingParams
 from track_fusion.rules.harmonic_mean import HarmonicMeanParams
-from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rows import Outcomes, Progress, chosen, row_by_row
 from track_fusion.study.rule_choice import RuleChoice, check_needs
 
 #: Weight of both densities in every fusion whose weights are not sought.
@@ -46,24 +46,13 @@ class Pair:
 
     parts: Mixture
 
-    @property
-    def tracks(self) -> SourceTracks:
-        """The densities as a rule takes them; those of one component as Gaussians."""
-        mean, cov = moments(self.parts)
-        return SourceTracks(mean, cov, mixture=self.parts if self.parts.count > 1 else None)
-
     def log_mean(self, points: Array, kind: Kind, weights: Sequence[float] = HALF) -> Array:
         """Logarithm (S,) of the harmonic or geometric mean density, not normalised, at points (S, 2)."""
         return log_mean_density(log_pdf(self.parts, points[None]), np.asarray(weights, float), kind)
 
     def by_rule(self, choice: RuleChoice) -> Row:
         """Fuse by a rule."""
-        rule, tracks = RULES[choice.key], self.tracks
-        return Row(
-            self,
-            lambda rng: rule.fuse(dataclasses.replace(tracks, extras={"seed": rng}), choice.params),
-            rule.uses("seed", choice.params),
-        )
+        return Row(self, lambda rng: choice.fuse(SourceTracks.of(self.parts, seed=rng)), choice.random)
 
     def by_grid(self, kind: Kind, inflation: float = 1.0) -> Row:
         """Take the moments of a mean density by summation; `inflation`: those that samples of wider densities have."""
@@ -82,8 +71,7 @@ class Pair:
 
     def divergence(self, fused: FusedTracks) -> float:
         """Kullback-Leibler divergence of the exact harmonic mean density from what was fused, in nats."""
-        mixture = fused.mixture or Mixture(np.ones(1), fused.mean[None], fused.cov[None])
-        return float(kl_on_grid(self.exact, log_pdf(mixture, POINTS)))
+        return float(kl_on_grid(self.exact, log_pdf(fused.density, POINTS)))
 
     def compare(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
         """Fuse by any rules: divergence of the exact harmonic mean density from each result, (R,).
@@ -114,15 +102,13 @@ def simulate(rows: Mapping[str, Row], runs: Sequence[int], seed: int, progress: 
     {row/mean: (R, 2), row/cov: (R, 2, 2), row/kld_nats: (R,)}, and for a mixture of M components row/weight
     (R, M), row/means (R, M, 2), row/covs (R, M, 2, 2)
     """
-    found: Outcomes = {}
-    rows = chosen(rows, only)
-    for done, (name, row) in enumerate(rows.items()):
-        which = runs if row.random else runs[:1]
-        fused = [row.fuse(stream(seed, run, "samples")) for run in which]
-        for column, values in _columns(row.pair, fused).items():
-            found[f"{name}/{column}"] = values if row.random else np.repeat(values, len(runs), 0)
-        progress((done + 1) / len(rows))
-    return found
+
+    def measure(row: Row) -> Outcomes:
+        each = runs if row.random else runs[:1]
+        columns = _columns(row.pair, [row.fuse(stream(seed, run, "samples")) for run in each])
+        return columns if row.random else {name: np.repeat(values, len(runs), 0) for name, values in columns.items()}
+
+    return row_by_row(chosen(rows, only), progress, measure)
 
 
 def _columns(pair: Pair, fused: Sequence[FusedTracks]) -> Outcomes:
@@ -142,7 +128,7 @@ def _columns(pair: Pair, fused: Sequence[FusedTracks]) -> Outcomes:
 
 def figures(rows: Mapping[str, Row], outcomes: Outcomes) -> dict[str, Estimate]:
     """Mean, determinant of the covariance and divergence of every row sampled."""
-    found = {}
+    measured = {}
     for name, row in rows.items():
         if f"{name}/mean" not in outcomes:
             continue
@@ -154,5 +140,5 @@ def figures(rows: Mapping[str, Row], outcomes: Outcomes) -> dict[str, Estimate]:
             "kld_nats": outcomes[f"{name}/kld_nats"],
         }
         for column, values in columns.items():
-            found[f"{name}/{column}"] = Estimate.mean(values) if row.random else Estimate.exact(values[0])
-    return found
+            measured[f"{name}/{column}"] = Estimate.mean(values) if row.random else Estimate.exact(values[0])
+    return measured

@@ -12,6 +12,7 @@ from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.mixture_geometric import MixtureGeometricParams
+from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import densities as shared
 from track_fusion.scenarios.sharma.densities import COVS, GMD_S, HALF, HMD_GA, HMD_S, Pair
 from track_fusion.study.chart import Chart, Contours
@@ -58,15 +59,15 @@ def charts(outcomes: Outcomes) -> list[Chart]:
     """Fig. 2: the sources, and each mean density exact and by one fusion of samples."""
     plane = np.stack(np.meshgrid(X, Y), -1).reshape(-1, 2)
     sources = tuple(_contours(f"p{i + 1}", log_pdf(PAIR.parts.at(i), plane)) for i in range(2))
-    found = [Chart("Sources", "x", "y", contours=sources, equal=True)]
+    panels = [Chart("Sources", "x", "y", contours=sources, equal=True)]
     kinds: dict[str, tuple[Kind, RuleChoice]] = {"GMD": ("geometric", GMD_S), "HMD": ("harmonic", HMD_S)}
     for title, (kind, choice) in kinds.items():
         row = f"given-{choice.name}"
         if f"{row}/weight" in outcomes:
             drawn = Mixture(*(outcomes[f"{row}/{column}"][0] for column in ("weight", "means", "covs")))
             lines = _contours(title, PAIR.log_mean(plane, kind)), _contours(f"{title}-S", log_pdf(drawn, plane))
-            found.append(Chart(f"{title}, exact and by samples (one run)", "x", "y", contours=lines, equal=True))
-    return found
+            panels.append(Chart(f"{title}, exact and by samples (one run)", "x", "y", contours=lines, equal=True))
+    return panels
 
 
 def _contours(label: str, log_density: Array) -> Contours:
@@ -78,10 +79,8 @@ def _contours(label: str, log_density: Array) -> Contours:
 SCENARIO = Scenario(
     key="sharma-mixtures",
     title="Two Gaussian mixtures, fused by sampling",
-    paper="Sharma et al., Harmonic Mean Density Fusion in Distributed Tracking, 5.2, Fig. 2",
+    paper=f"{PAPER}, 5.2, Fig. 2",
     shows="the geometric and the harmonic mean of mixtures, sampled beside exact, and what Gaussian stand-ins lose",
-    published={},
-    published_runs=1,
     default_runs=200,
     publication_runs=1000,
     assumptions=(

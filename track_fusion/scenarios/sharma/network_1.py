@@ -12,6 +12,7 @@ from track_fusion.linalg import Array, matvec
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.peers.peer import Round
 from track_fusion.random_streams import stream
+from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import network as shared
 from track_fusion.scenarios.sharma.network import RULE_CHOICES, Local, Network, Tracks, common_claims
 from track_fusion.study.chart import Chart
@@ -81,9 +82,8 @@ def _bloated(text: str, reading: str) -> Claim:
 SCENARIO = Scenario(
     key="sharma-network-1",
     title="Ten nodes in a network, one measurement each",
-    paper="Sharma et al., Harmonic Mean Density Fusion in Distributed Tracking, 6.2, Figs. 4 and 6",
+    paper=f"{PAPER}, 6.2, Figs. 4 and 6",
     shows="what each rule reports and how large its errors are where the same news comes by several ways",
-    published={},
     published_runs=50_000,
     default_runs=20_000,
     publication_runs=50_000,

@@ -11,6 +11,7 @@ from track_fusion.filters.kalman import predict, update, update_joint
 from track_fusion.linalg import matvec
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.random_streams import stream
+from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import network as shared
 from track_fusion.scenarios.sharma.network import RULE_CHOICES, Local, Network, Tracks, common_claims
 from track_fusion.study.chart import Chart
@@ -66,9 +67,8 @@ def _almost(central: Estimate, harmonic: Estimate) -> bool:
 SCENARIO = Scenario(
     key="sharma-network-2",
     title="Five nodes track for five steps, then fuse at one",
-    paper="Sharma et al., Harmonic Mean Density Fusion in Distributed Tracking, 6.3, Figs. 5 and 7",
+    paper=f"{PAPER}, 6.3, Figs. 5 and 7",
     shows="what each rule reports and how large its errors are where tracks share process noise and a prior",
-    published={},
     published_runs=50_000,
     default_runs=20_000,
     publication_runs=50_000,
