@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from track_fusion.filters.gaussian_sum_modes import MixtureModes
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate, rmse
-from track_fusion.peers.peer import Fuse, Peer
+from track_fusion.peers import Fuse, Peer
 from track_fusion.rules.mixture_wep import MixtureWepParams
 from track_fusion.scenarios.ahmed import PAPER
 from track_fusion.scenarios.ahmed.platforms import (

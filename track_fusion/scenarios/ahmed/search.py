@@ -18,7 +18,7 @@ from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.models.detection import SoftmaxDetector
 from track_fusion.params import ParameterError
-from track_fusion.peers.peer import Fuse, Peer, by_rule, communicate, on_tree, star, sweep
+from track_fusion.peers import Fuse, Peer, by_rule, communicate, on_tree, star, sweep
 from track_fusion.random_streams import stream
 from track_fusion.rules.mixture_exact import MixtureExactParams
 from track_fusion.rules.mixture_wep import MixtureWepParams

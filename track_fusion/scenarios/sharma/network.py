@@ -11,7 +11,7 @@ import numpy as np
 from track_fusion.linalg import Array, outer
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.metrics.consistency import nees
-from track_fusion.peers.peer import Peer, Round, communicate
+from track_fusion.peers import Peer, Round, communicate
 from track_fusion.random_streams import stream
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.ellipsoidal_intersection import EllipsoidalIntersectionParams

@@ -10,7 +10,7 @@ import numpy as np
 from track_fusion.filters.kalman import update, update_joint
 from track_fusion.linalg import Array, matvec
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.peers.peer import Round
+from track_fusion.peers import Round
 from track_fusion.random_streams import stream
 from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import network as shared

@@ -9,11 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.association.assignment import nearest_pairs
 from track_fusion.centre.centre import FusionCentre, FusionCentreParams
 from track_fusion.centre.track_manager import TrackManagerParams
 from track_fusion.linalg import Array
-from track_fusion.metrics.consistency import nees
+from track_fusion.metrics.pairing import paired
 from track_fusion.models.geodetic import LocalFrame
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
@@ -174,15 +173,13 @@ class Judged(NamedTuple):
 def judged(tracks: TrackBatch, truth: Array) -> Judged:
     """Pair tracks and targets, truth (N, n), one to one by least total distance, within REACH_M."""
     mean, cov = tracks.moments
-    at = list(LAYOUT.position)
-    target, track = nearest_pairs(truth[:, at], mean[:, at], REACH_M)
-    count = len(truth)
-    found = Judged(np.full((count, 2), np.nan), np.full(count, np.nan), np.full(count, np.nan),
-                   np.array(float(len(mean) - len(track))))  # fmt: skip
-    found.position[target] = mean[track][:, at]
-    found.nees[target] = nees(mean[track] - truth[target], cov[track])
-    found.variance[target] = cov[track][:, at, at].sum(-1)
-    return found
+    pairs, at, lost = paired(LAYOUT, truth, mean, cov, REACH_M), list(LAYOUT.position), np.full(len(truth), np.nan)
+    false = np.array(float(len(mean) - len(pairs.track)))
+    position, score, variance = np.full((len(truth), 2), np.nan), lost.copy(), lost
+    position[pairs.target] = mean[pairs.track][:, at]
+    score[pairs.target] = pairs.nees
+    variance[pairs.target] = cov[pairs.track][:, at, at].sum(-1)
+    return Judged(position, score, variance, false)
 
 
 def judged_alone(scans: Mapping[int, TrackBatch], truth: Array) -> Judged:
