@@ -30,6 +30,19 @@ class Solution:
     converged: NDArray[np.bool_]
     iterations: NDArray[np.intp]
 
+    @classmethod
+    def alone(cls, batch: int) -> Solution:
+        """All weight on the only source."""
+        return cls(np.ones((batch, 1)), np.ones(batch, bool), np.zeros(batch, np.intp))
+
+    def of_both(self) -> Solution:
+        """Make weights (B, 2) of two sources of the first one's (B,)."""
+        return dataclasses.replace(self, weights=np.stack([self.weights, 1.0 - self.weights], -1))
+
+    def __getitem__(self, rows: NDArray[np.intp]) -> Solution:
+        """Pick some of the batch."""
+        return Solution(self.weights[rows], self.converged[rows], self.iterations[rows])
+
     @staticmethod
     def concatenate(parts: Sequence[Solution]) -> Solution:
         """Join the solutions of the pieces of a batch."""

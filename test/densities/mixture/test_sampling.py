@@ -117,7 +117,7 @@ def test_weighted_em_does_not_depend_on_the_batch() -> None:
 
 def test_single_shot_em_keeps_the_moments_of_the_samples() -> None:
     quotient = exact_quotient(FIRST, SECOND, COMMON)
-    proposal = laplace_proposal(quotient)
+    proposal = laplace_proposal(laplace(quotient))
     drawn = indirect_global_sampling(quotient, proposal, np.random.default_rng(0), 500, floor=0.0)
     for got, wanted in zip(moments(drawn.mixture), drawn.samples.moments(), strict=True):
         np.testing.assert_allclose(got, wanted, rtol=1e-10)
@@ -138,7 +138,7 @@ def test_single_shot_em_survives_mixands_without_samples() -> None:
 def test_igs_and_its_proposal_against_quadrature() -> None:
     quotient = exact_quotient(FIRST, SECOND, COMMON)
     wanted = [mixand_moments(quotient, z) for z in range(4)]
-    found = indirect_global_sampling(quotient, laplace_proposal(quotient), np.random.default_rng(0), 40000)
+    found = indirect_global_sampling(quotient, laplace_proposal(laplace(quotient)), np.random.default_rng(0), 40000)
     total = sum(w[0] for w in wanted)
     assert found.samples.log_eta == pytest.approx(np.log(total), abs=0.02)
     for z, (mass, mean, variance) in enumerate(wanted):

@@ -39,11 +39,7 @@ class Mixture:
 
     def take(self, index: NDArray[np.intp]) -> Mixture:
         """Pick components (..., P) of each mixture by index."""
-        return Mixture(
-            np.take_along_axis(self.weight, index, -1),
-            np.take_along_axis(self.mean, index[..., None], -2),
-            np.take_along_axis(self.cov, index[..., None, None], -3),
-        )
+        return Mixture(*(take_components(a, index) for a in (self.weight, self.mean, self.cov)))
 
     def at(self, key: Any) -> Mixture:
         """Index the leading axes of all three arrays alike."""
@@ -56,6 +52,16 @@ class Mixture:
             np.broadcast_to(self.mean, (*lead, *self.mean.shape[-2:])),
             np.broadcast_to(self.cov, (*lead, *self.cov.shape[-3:])),
         )
+
+
+def take_components(array: NDArray[Any], index: NDArray[np.intp]) -> NDArray[Any]:
+    """Pick components (..., P) of an array (..., C, ...) by index."""
+    return np.take_along_axis(array, component_index(array, index), index.ndim - 1)
+
+
+def component_index(array: NDArray[Any], index: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Give an index (..., P) of components as many axes as an array (..., C, ...) has."""
+    return index.reshape(*index.shape, *(1,) * (array.ndim - index.ndim))
 
 
 def gaussian(mean: Array, cov: Array) -> Mixture:
@@ -100,10 +106,9 @@ class Factored:
     white: Array
 
     @classmethod
-    def of(cls, mixture: Mixture, log_weight: Array | None = None) -> Factored:
-        """Factor a mixture; `log_weight` (..., C) replaces its weights where they would underflow."""
-        white = whitener(mixture.cov)
-        return cls(log_of(mixture.weight) if log_weight is None else log_weight, mixture.mean, white)
+    def of(cls, mixture: Mixture) -> Factored:
+        """Factor a mixture."""
+        return cls(log_of(mixture.weight), mixture.mean, whitener(mixture.cov))
 
     @property
     def lead(self) -> tuple[int, ...]:

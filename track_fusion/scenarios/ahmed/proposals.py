@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from track_fusion.densities.log_domain import log_sum_exp, normalised
-from track_fusion.densities.mixture.mixture import Factored, Mixture, log_pdf
+from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.densities.mixture.proposals import (
     Proposal,
     direct_local_sampling,
@@ -90,8 +90,7 @@ class Case:
         self.quotient: Quotient = exact_quotient(*parts)
         self.bound: Bound = exact_bound(self.quotient, self.problem.common)
         self.laplace: Laplace = laplace(self.quotient)
-        weight, mean, cov = self.quotient.numerator
-        joint = Factored.of(Mixture(np.ones(weight.shape), mean, cov), weight).joint(GRID)
+        joint = self.quotient.numerator.factored.joint(GRID)
         #: Logarithm of the un-normalised mixands on the grid, (M, S), and of their integrals, (M,).
         self.log_mixands = joint - log_pdf(self.problem.common, GRID)
         self.log_weight = log_sum_exp(self.log_mixands) + np.log(CELL_AREA)
