@@ -8,20 +8,9 @@ from functools import lru_cache
 
 from sensor_msgs.msg import PointCloud2
 
-from msg_adapters._table import (
-    PLANS,
-    Block,
-    Fields,
-    Layout,
-    Rows,
-    Signature,
-    cov_name,
-    make_layout,
-    new_cloud,
-    signature,
-    upper_pairs,
-    upper_triangle,
-)
+from msg_adapters._table import PLANS, cov_name, upper_pairs
+from msg_adapters._table_reading import Block, Fields, Rows, Signature, signature
+from msg_adapters._table_writing import Layout, make_layout, new_cloud, upper_triangle
 from msg_adapters.arrays import DetectionArrays
 from msg_adapters.header import stamp_to_ns
 

@@ -11,20 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
 
-from msg_adapters._table import (
-    PLANS,
-    Block,
-    Column,
-    Fields,
-    Layout,
-    Rows,
-    Signature,
-    cov_name,
-    make_layout,
-    new_cloud,
-    signature,
-    upper_triangle,
-)
+from msg_adapters._table import PLANS, cov_name
+from msg_adapters._table_reading import Block, Column, Fields, Rows, Signature, signature
+from msg_adapters._table_writing import Layout, make_layout, new_cloud, upper_triangle
 from msg_adapters.arrays import MessageError, TrackArrays, TrackLike
 from msg_adapters.header import stamp_to_ns
 

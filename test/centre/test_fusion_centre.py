@@ -1,15 +1,14 @@
 """The fusion centre: against an oracle that shares no code with it, the field's pains, consistency."""
 
 import dataclasses
-import importlib.util
-from pathlib import Path
 
 import numpy as np
 import pytest
+from oracles.fusion_centre import Settings, arithmetic_average, covariance_intersection, naive, run_centre
 from scipy.stats import chi2
 
-from track_fusion.centre.centre import FusionCentre, FusionCentreParams
-from track_fusion.centre.track_manager import TrackManagerParams
+from track_fusion.centre.centre import FusionCentre
+from track_fusion.centre.config import CentreConfig, FusionCentreParams, SourceConfig, TrackManagerParams
 from track_fusion.filters.kalman import predict, update
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
@@ -26,10 +25,16 @@ COV = np.diag([1.0, 1.0, 0.5, 0.5])
 EAGER = TrackManagerParams(confirmation_threshold=(1, 1))
 
 
+def fusion_centre(sources, motion, rule, rule_params=None, params=None, **others):
+    names = tuple(SourceConfig(f"source_{k}") for k in range(sources))
+    params = params or FusionCentreParams()
+    return FusionCentre(CentreConfig(names, motion, "map", rule, rule_params or rule.params(), params, **others))
+
+
 def centre(sources=2, rule="covariance_intersection", rule_params=None, manager=EAGER, motion=None, **params):
-    params = FusionCentreParams(state_fusion=rule, **params)
     motion = NearlyConstantVelocity(LAYOUT, motion or MotionParams(process_noise=1.0))
-    return FusionCentre(sources, motion, "map", params, rule_params, manager)
+    params = FusionCentreParams(**params)
+    return fusion_centre(sources, motion, RULES[rule], rule_params, params, manager=manager)
 
 
 def tracks(positions, time_ns, cov=COV, **fields):
@@ -39,17 +44,6 @@ def tracks(positions, time_ns, cov=COV, **fields):
 
 
 # ---- against the oracle of the golden bags --------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def oracle():
-    """The oracle behind the golden bags: plain loops after doc/fusion-centre.md."""
-    pytest.importorskip("rosbags")
-    path = Path(__file__).parents[1] / "data" / "make_golden.py"
-    spec = importlib.util.spec_from_file_location("make_golden", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def random_scans(rng, sources):
@@ -77,27 +71,24 @@ def random_scans(rng, sources):
 @pytest.mark.parametrize("memory", [False, True], ids=["memoryless", "memory"])
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_random_scenes_equal_the_oracle(oracle, monkeypatch, seed, count, memory):
+def test_random_scenes_equal_the_oracle(seed, count, memory):
     rng = np.random.default_rng(1000 * count + seed)
     names = [f"sensor_{k}" for k in range(count)]
     pairs = count + memory == 2  # what the oracle's covariance intersection can do
-    rule = ("naive", "arithmetic_average", "covariance_intersection")[seed % (3 if pairs else 2)]
+    rule = (naive, arithmetic_average, covariance_intersection)[seed % (3 if pairs else 2)]
     scans = random_scans(rng, names)
-    changed = {
-        "sources": names, "deletion_threshold": [3, 4], "max_coast_s": 0.7, "max_scan_age_s": 0.15,
-        "gate_probability": (0.99, 0.7)[seed % 2],
-    }  # fmt: skip
-    settings = oracle.PARAMETERS | changed
-    monkeypatch.setattr(oracle, "PARAMETERS", settings)
-    monkeypatch.setattr(oracle, "MEMORY", memory)
-    wanted, _, margins = oracle.run_centre(scans, getattr(oracle, rule))
+    settings = Settings(
+        names, max_scan_age_s=0.15, gate_probability=(0.99, 0.7)[seed % 2], confirmation_threshold=(2, 3),
+        deletion_threshold=(3, 4), max_coast_s=0.7, process_noise=2.0, memory=memory,
+    )  # fmt: skip
+    wanted, _, margins = run_centre(scans, rule, settings)
     assert min(margins["gate"] + margins["assignment"], default=1.0) > 1e-9, "a decision hangs on rounding"
 
-    given = {k: settings[k] for k in ("gate_probability", "max_scan_age_s")}
-    manager = TrackManagerParams(**{k: settings[k] for k in TrackManagerParams.__dataclass_fields__})
-    motion = MotionParams(noise_form=settings["noise_form"], process_noise=settings["process_noise"])
-    rule_params = ArithmeticAverageParams(criterion="uniform") if rule == "arithmetic_average" else None
-    fuser = centre(count, rule, rule_params, manager, motion, memory=memory, **given)
+    given = {k: getattr(settings, k) for k in ("gate_probability", "max_scan_age_s", "memory")}
+    manager = TrackManagerParams(**{k: getattr(settings, k) for k in TrackManagerParams.__dataclass_fields__})
+    motion = MotionParams(noise_form="piecewise_constant", process_noise=settings.process_noise)
+    rule_params = ArithmeticAverageParams(criterion="uniform") if rule is arithmetic_average else None
+    fuser = centre(count, rule.__name__, rule_params, manager, motion, **given)
     published = 0
     for step in wanted:
         new = {}
@@ -252,7 +243,8 @@ def test_a_scan_used_before_starts_nothing():
         1, max_scan_age_s=10.0, manager=TrackManagerParams(deletion_threshold=(1, 1)), publish_tentative=True
     )
     fuser.step(0, {0: tracks([[0, 0]], 0)})
-    fuser._manager._keep(np.zeros(1, bool))  # as if the track had been deleted
+    none = fuser.state.central[np.zeros(1, bool)]  # as if the track had been deleted
+    fuser.state = dataclasses.replace(fuser.state, central=none)
     fused, _ = fuser.step(SECOND, {})
     assert len(fused) == 0
 
@@ -624,8 +616,7 @@ def test_particles_of_an_earlier_scan_are_predicted_with_process_noise():
 def test_a_turning_target_is_predicted_along_its_turn():
     layout = StateLayout(("x", "y", "vx", "vy", "turn_rate"))
     motion = CoordinatedTurn(layout, CoordinatedTurnParams(process_noise=0.1, turn_rate_noise=1e-6))
-    params = FusionCentreParams(state_fusion="naive", max_scan_age_s=10.0)
-    own = FusionCentre(1, motion, "map", params, manager_params=EAGER)
+    own = fusion_centre(1, motion, RULES["naive"], params=FusionCentreParams(max_scan_age_s=10.0), manager=EAGER)
     state = np.array([[0.0, 0.0, 10.0, 0.0, np.pi / 8]])
     scan = TrackBatch.gaussian(layout, "map", state, 1e-4 * np.eye(5)[None], time_ns=SECOND)
     fused, _ = own.step(5 * SECOND, {0: scan})
@@ -638,9 +629,8 @@ def test_a_turning_target_is_predicted_along_its_turn():
 
 def test_a_rule_that_samples_goes_on_in_its_stream_and_begins_anew_after_reset():
     random = RandomParams(seed=4, run=2, role="centre")
-    params = FusionCentreParams(state_fusion="geometric_mean_sampling")
     motion = NearlyConstantVelocity(LAYOUT, MotionParams())
-    own = FusionCentre(2, motion, "map", params, manager_params=EAGER, random=random)
+    own = fusion_centre(2, motion, RULES["geometric_mean_sampling"], manager=EAGER, random=random)
     rng, rule, found = stream(4, 2, "centre"), RULES["geometric_mean_sampling"], []
     for k in (1, 2):
         scans = {0: tracks([(0, 0)], k * SECOND), 1: tracks([(1, 0)], k * SECOND, 3 * COV)}
@@ -678,7 +668,7 @@ def test_every_rule_but_one_that_joins_particles_takes_their_gaussian(rule, late
 
 def screening(batch):
     """What a reader of the batch rejects."""
-    fields = {name: value for name, value in vars(batch).items() if name != "moments"}
+    fields = {field.name: getattr(batch, field.name) for field in dataclasses.fields(batch)}
     return TrackBatch.screened(**fields)[1]
 
 
@@ -778,8 +768,8 @@ def failing(how):
 
 @pytest.mark.parametrize("how", ["not finite", "no covariance", "error"])
 def test_a_fusion_without_a_density_harms_no_other_target(how):
-    params, motion = FusionCentreParams(), NearlyConstantVelocity(LAYOUT, MotionParams())
-    own = FusionCentre(3, motion, "map", params, manager_params=EAGER, rule=failing(how))
+    motion = NearlyConstantVelocity(LAYOUT, MotionParams())
+    own = fusion_centre(3, motion, failing(how), manager=EAGER)
     good = centre(3, rule="naive", motion=MotionParams())
     near, far = (0, 0), (2000, 0)
     for k in range(3):

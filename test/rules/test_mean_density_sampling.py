@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from densities.mixture.test_mixture import draw
-from rules.test_mixture_averages import as_tracks
+from densities.mixture.examples import draw
+from rules.mixtures import as_tracks
 
 from track_fusion.densities.mixture.mean_density import log_mean_density, sample_mean_density
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf

@@ -8,7 +8,9 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import click
+from rich.markup import escape
 
+from track_fusion.cli import output
 from track_fusion.params import ParameterError
 
 if TYPE_CHECKING:
@@ -40,7 +42,6 @@ def compare(name: str, rules: str, params: str, runs: int | None, seed: int, job
       track-fusion compare li2022-linear --rules covariance_intersection,arithmetic_average,naive
       track-fusion compare li2022-linear --rules ./my_rule.py,covariance_intersection@uniform --runs 1000
     """  # noqa: D301  click reads \b as "do not wrap"
-    from track_fusion.cli.output import print_json
     from track_fusion.cli.progress import results
     from track_fusion.metrics.significance import paired_differences
     from track_fusion.scenarios import find_scenario
@@ -58,7 +59,7 @@ def compare(name: str, rules: str, params: str, runs: int | None, seed: int, job
     groups = by_filter_and_quantity(result.outcomes)
     differences = {group: paired_differences(scores) for group, scores in groups.items()}
     if as_json:
-        print_json(_as_json(scenario, count, seed, groups, differences))
+        output.print_json(_as_json(scenario, count, seed, groups, differences))
     else:
         _print(scenario, count, seed, groups, differences)
 
@@ -126,21 +127,18 @@ def _print(
     scenario: Scenario, runs: int, seed: int, groups: Mapping[tuple[str, str], Outcomes],
     differences: Mapping[tuple[str, str], list[Difference]],
 ) -> None:  # fmt: skip
-    from rich.markup import escape
-
-    from track_fusion.cli.output import console, table
     from track_fusion.metrics.accuracy import Estimate
     from track_fusion.report.page import measured_text, quantity_text
 
-    out = console()
+    out = output.console()
     out.print(f"[bold]{escape(scenario.key)}[/bold]  {runs} run{'s' * (runs > 1)}, seed {seed}, smaller is better")
     for (one, quantity), scores in groups.items():
-        means = table("rule", "mean ± standard error", title=f"{one}: {quantity_text(quantity)}")
+        means = output.table("rule", "mean ± standard error", title=f"{one}: {quantity_text(quantity)}")
         for rule in sorted(scores, key=lambda r: float(scores[r].mean())):
             mean = Estimate.mean(scores[rule])
             means.add_row(escape(rule), measured_text(mean.value, mean.standard_error))
         out.print("", means)
-        pairs = table("better", "worse", "by", "p")
+        pairs = output.table("better", "worse", "by", "p")
         for d in differences[one, quantity]:
             by = measured_text(d.mean, d.standard_error)
             style = "" if d.significant else "dim"

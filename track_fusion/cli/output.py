@@ -30,18 +30,18 @@ def console(*, stderr: bool = False) -> Console:
 
 def table(*columns: str, title: str | None = None) -> Table:
     """Return a table without frame, narrow enough for a terminal of 80 columns; long words wrap."""
-    found = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    bare = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
     for column in columns:
-        found.add_column(column, overflow="fold")
-    return found
+        bare.add_column(column, overflow="fold")
+    return bare
 
 
 def grid(facts: Iterable[tuple[str, str]]) -> Table:
     """Return names beside texts, slightly indented."""
-    found = Table.grid(padding=(0, 2, 0, 0))
+    pairs = Table.grid(padding=(0, 2, 0, 0))
     for name, text in facts:
-        found.add_row(f"  {escape(name)}", escape(text))
-    return found
+        pairs.add_row(f"  {escape(name)}", escape(text))
+    return pairs
 
 
 def plain(value: Any) -> Any:

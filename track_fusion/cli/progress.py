@@ -7,15 +7,16 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from track_fusion.cli.output import console
+
 if TYPE_CHECKING:
     from track_fusion.study.study import Result, Study
 
 
 def results(studies: Sequence[Study], jobs: int, store: Path | None) -> Iterator[Result]:
     """Run studies, showing on a terminal how far each is; yield each's result as it is done."""
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-
-    from track_fusion.cli.output import console
     from track_fusion.study.processes import run_studies
 
     err = console(stderr=True)

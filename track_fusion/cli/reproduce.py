@@ -10,6 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from rich.markup import escape
+
+from track_fusion.cli import output
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -61,7 +64,6 @@ def reproduce(
       track-fusion reproduce --all --out out/all
       track-fusion reproduce ./my_scenario.py --json
     """  # noqa: D301  click reads \b as "do not wrap"
-    from track_fusion.cli.output import print_json
     from track_fusion.cli.progress import results
     from track_fusion.scenarios import SCENARIOS, find_scenario
     from track_fusion.study.study import Study
@@ -88,7 +90,7 @@ def reproduce(
     _write(out, sections)
     if as_json:
         answers = [section.result for section in sections]
-        print_json(answers[0] if len(answers) == 1 else answers)
+        output.print_json(answers[0] if len(answers) == 1 else answers)
     else:
         click.echo(f"Written: {out / 'report.html'}, {out / 'results.json'}")
 
@@ -115,10 +117,9 @@ def _write(out: Path, sections: Sequence[Section]) -> None:
     import numpy as np
 
     from track_fusion.cli.app import version
-    from track_fusion.cli.output import plain
     from track_fusion.report.page import page
 
-    content = [{**plain(s.result), "charts": plain(s.charts)} for s in sections]
+    content = [{**output.plain(s.result), "charts": output.plain(s.charts)} for s in sections]
     (out / "results.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     made = f"track_fusion {version()}, NumPy {np.__version__}, {time.strftime('%Y-%m-%d %H:%M')}"
     (out / "report.html").write_text(page(sections, made), encoding="utf-8")
@@ -126,12 +127,9 @@ def _write(out: Path, sections: Sequence[Section]) -> None:
 
 def _print_tables(section: Section) -> None:
     """Print a table a quantity, then the claims."""
-    from rich.markup import escape
-
-    from track_fusion.cli.output import console, grid, table
     from track_fusion.report.page import assumption_text, by_quantity, evidence_text, unpublished
 
-    out, (result, scenario, _, took_s) = console(), section
+    out, (result, scenario, _, took_s) = output.console(), section
     out.print(f"[bold]{escape(scenario.key)}[/bold]  {escape(scenario.title)}")
     groups = by_quantity(result["figures"])
     folded = unpublished(groups)
@@ -141,7 +139,7 @@ def _print_tables(section: Section) -> None:
     if folded:
         out.print(f"\n{sum(len(groups[q]) for q in folded)} figures with nothing published: see report.html")
     if result["claims"]:
-        claims = table("claim", "verdict", title="claims")
+        claims = output.table("claim", "verdict", title="claims")
         for c in result["claims"]:
             claims.add_row(
                 escape(f"{c['claim']} ({evidence_text(c['evidence'])})"), f"[{STYLES[c['verdict']]}]{c['verdict']}[/]"
@@ -152,20 +150,17 @@ def _print_tables(section: Section) -> None:
         ("Runs", f"{result['runs']}, seed {result['seed']}, {took_s:.1f} s of one processor"),
         ("Paper", scenario.paper),
     ]
-    out.print(grid([*facts, *(("Assumed", assumption_text(a)) for a in scenario.assumptions)]))
+    out.print(output.grid([*facts, *(("Assumed", assumption_text(a)) for a in scenario.assumptions)]))
 
 
 def _table(quantity: str, figures: Sequence[Mapping[str, Any]]) -> Table:
-    from rich.markup import escape
-
-    from track_fusion.cli.output import table
     from track_fusion.report.page import measured_text, published_text, quantity_text
 
     title = f"{quantity_text(quantity)}, ± standard error"
-    found = table("filter and rule", "measured", "published", "verdict", title=title)
-    found.columns[1].justify = found.columns[2].justify = "right"
+    compared = output.table("filter and rule", "measured", "published", "verdict", title=title)
+    compared.columns[1].justify = compared.columns[2].justify = "right"
     for f in figures:
         verdict = f"[{STYLES[f['verdict']]}]{f['verdict']}[/]"
         measured = measured_text(f["value"], f["standard_error"])
-        found.add_row(escape(f["name"].rpartition("/")[0]), measured, published_text(f["published"]), verdict)
-    return found
+        compared.add_row(escape(f["name"].rpartition("/")[0]), measured, published_text(f["published"]), verdict)
+    return compared

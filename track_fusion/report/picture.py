@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from track_fusion.linalg import Array
+from track_fusion.report.drawing import pyplot
 
 #: Ellipses are drawn at this many standard deviations.
 SIGMAS = 2.0
@@ -40,11 +41,7 @@ def draw(path: Path, title: str, truth: Line, tracks: Sequence[Line], errors: st
     tracks : sequence of Line  the same T steps; the last is drawn on top with its ellipses
     errors : str               title of the error panel
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
+    plt = pyplot()
     figure, (course, close, error) = plt.subplots(1, 3, figsize=(16, 5.2), constrained_layout=True)
     figure.suptitle(title)
     flat = truth.position.shape[1] == 1
@@ -87,11 +84,7 @@ def _course(line: Line, start: int) -> tuple[Array, Array]:
 
 def draw_map(path: Path, title: str, lines: Sequence[Line]) -> None:
     """Draw the positions of many targets in one plane as PNG: the first is the truth, each a set of points."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
+    plt = pyplot()
     figure, axes = plt.subplots(figsize=(10, 9), constrained_layout=True)
     for order, line in enumerate(lines):
         size, (x, y) = 1.0 if line.cov is None else 9.0 / order, line.position.T / 1e3

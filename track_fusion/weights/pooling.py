@@ -48,7 +48,7 @@ def _pooling_weights(mean: Array, cov: Array, naive: bool) -> Solution:
     """
     batch, count = mean.shape[:2]
     if count == 1:
-        return Solution.alone(batch)
+        return Solution.known(np.ones((batch, 1)))
     if count > 2:
         return minimise_on_simplex(_gradient_hessian(mean, cov, naive), batch, count)
     return minimise_on_interval(_pair_derivatives(mean, cov, naive), batch).of_both()

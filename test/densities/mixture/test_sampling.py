@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from densities.mixture.test_mixture import draw
-from densities.mixture.test_quotient import COMMON, FIRST, SECOND, mixand_moments
+from densities.mixture.examples import COMMON, FIRST, SECOND, draw, mixand_moments
 from scipy import integrate
 from scipy.optimize import minimize_scalar
 

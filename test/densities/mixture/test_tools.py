@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from densities.mixture.test_mixture import draw
+from densities.mixture.examples import draw
 from scipy import integrate
 
 from track_fusion.densities.mixture import reduction

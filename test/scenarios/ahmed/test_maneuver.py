@@ -22,6 +22,7 @@ def outcomes():
     return maneuver.simulate(range(2), 0, lambda share: None, steps=STEPS)
 
 
+@pytest.mark.slow
 def test_errors_right_after_the_fusions_are_those_of_the_errata(outcomes):
     """ERRATA, Example 4: IGS median <= 30 m; log10 ratio FOCI / IGS >= .7 at platform 2; centralised <= IGS."""
     found = maneuver.figures(outcomes)
@@ -33,6 +34,7 @@ def test_errors_right_after_the_fusions_are_those_of_the_errata(outcomes):
     assert order["verdict"] == "agrees"
 
 
+@pytest.mark.slow
 def test_figures_are_what_they_say(outcomes):
     found = maneuver.figures(outcomes)
     error = outcomes["gsf-mixture_wep error"]
@@ -49,6 +51,7 @@ def test_figures_are_what_they_say(outcomes):
     assert found["gsf-mixture_wep@foci/log10_error_ratio_to_igs_p2_1"].value == pytest.approx(np.mean(ratio))
 
 
+@pytest.mark.slow
 def test_until_they_talk_the_platforms_are_the_independent_ones(outcomes):
     for row in (maneuver.BY_IGS, maneuver.BY_FOCI):
         np.testing.assert_array_equal(outcomes[f"{row} error"][:, :, :59], outcomes["gsf-alone error"][:, :, :59])
@@ -142,6 +145,7 @@ def test_pieces_equal_the_whole_and_progress_goes_up(monkeypatch):
         np.testing.assert_allclose(values[0], whole[name][1], rtol=1e-9, atol=1e-9, err_msg=name)
 
 
+@pytest.mark.slow
 def test_charts_and_figures_cope_with_parts(outcomes):
     assert len(maneuver.charts(outcomes)) == 1 + 4 + 2
     centre = {name: values for name, values in outcomes.items() if name.startswith(("truth", maneuver.CENTRE))}

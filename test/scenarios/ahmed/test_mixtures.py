@@ -57,6 +57,7 @@ def of(figures: dict[str, Estimate], rule: str, variant: str, quantity: str = "k
 # The random study.
 
 
+@pytest.mark.slow
 def test_medians_lie_within_the_bounds_of_the_errata(study: dict[str, Estimate]) -> None:
     for rule, most_dls, most_igs in (("exact", 0.03, 0.06), ("wep", 0.012, 0.06)):
         assert of(study, rule, "dls_200") <= most_dls
@@ -66,6 +67,7 @@ def test_medians_lie_within_the_bounds_of_the_errata(study: dict[str, Estimate])
     assert of(study, "wep", "igs_100") > of(study, "wep", "foci")  # a hundred samples are worse than none
 
 
+@pytest.mark.slow
 def test_more_samples_are_always_better(study: dict[str, Estimate]) -> None:
     for rule in ("exact", "wep"):
         for method, counts in (("dls", (10, 50, 100, 200)), ("igs", (100, 500, 1000, 2000))):
@@ -73,6 +75,7 @@ def test_more_samples_are_always_better(study: dict[str, Estimate]) -> None:
             assert medians == sorted(medians, reverse=True), (rule, method)
 
 
+@pytest.mark.slow
 def test_a_proposal_that_counts_overlaps_needs_fewer_samples(study: dict[str, Estimate]) -> None:
     for count in (100, 500, 1000, 2000):
         for quantity, better in (("kld_nats", -1.0), ("effective_samples_1", 1.0)):
@@ -82,6 +85,7 @@ def test_a_proposal_that_counts_overlaps_needs_fewer_samples(study: dict[str, Es
             assert better * (ours - printed) > 0
 
 
+@pytest.mark.slow
 def test_claims_about_the_study_are_judged_as_the_errata_say(study: dict[str, Estimate]) -> None:
     found = {c["claim"]: c["verdict"] for c in judged_claims(ahmed_random.SCENARIO, study)}
     for kind in ("exact", "WEP"):

@@ -29,6 +29,7 @@ def local(start):
     return {robot: search.searched(start, [robot]) for robot in search.ROBOTS}
 
 
+@pytest.mark.slow
 def test_divergences_are_those_of_the_errata(start, centre, local):
     """ERRATA, Example 3: below a quarter of MMGD's and below robot 3's own; most of the error is local filtering."""
     rows = {choice.name: choice for choice in search.RULE_CHOICES}

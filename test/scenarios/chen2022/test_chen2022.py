@@ -255,6 +255,7 @@ def armses(errors: Outcomes) -> dict[str, float]:
     return {name.removeprefix("stf-"): float(np.sqrt(squares.mean(0)).mean()) for name, squares in errors.items()}
 
 
+@pytest.mark.slow
 def test_order_of_case_2(errors: dict[str, Outcomes]) -> None:
     """ERRATA: MHDP < QMMHD < {GP, FCI, KLA} < DCI with MHDP <= .8 KLA."""
     found = armses(errors["II"])
@@ -279,6 +280,7 @@ def test_excess_has_the_spread_of_paired_studies() -> None:
     assert spread < 0.6 * np.mean([figures[f"stf-{GP}/{dynamic.FIGURE}"].standard_error for figures in found])
 
 
+@pytest.mark.slow
 def test_claims_of_case_2_hold_with_the_student_t_filter(errors: dict[str, Outcomes]) -> None:
     found = judged_claims(case_2.SCENARIO, dynamic.figures(errors["II"]))
     assert [claim["verdict"] for claim in found] == ["agrees"] * 3
@@ -292,12 +294,14 @@ def test_the_rule_behind_mhdp_is_the_one_of_the_printed_column() -> None:
                          f"gstm-{FCI}/{figure}"]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_advantage_of_mhdp_in_case_1_does_not_reproduce(errors: dict[str, Outcomes]) -> None:
     """ERRATA."""
     found = judged_claims(case_1.SCENARIO, dynamic.figures(errors["I"]))
     assert [claim["verdict"] for claim in found] == ["does not reproduce"] * 2 + ["agrees"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_determinant_intersection_is_far_worse_and_the_two_mhdp_agree(errors: dict[str, Outcomes], case: str) -> None:
     """ERRATA: DCI > 2 x every other rule in both cases; |MHDP-E - MHDP-I| <= .02 m."""

@@ -226,6 +226,7 @@ def measured():
     return SCENARIO.measure(1, 1)
 
 
+@pytest.mark.slow
 def test_what_errata_says_holds_in_one_run(measured):
     """ERRATA: NEES of CI below those of ICI and HMD-GA in categories A and B. The order of errors is not robust."""
     for c in "ab":
@@ -245,6 +246,7 @@ def test_what_errata_says_holds_in_one_run(measured):
     assert 0.0 <= measured[f"pda-{CI}/false_tracks_1"].value < 5.0
 
 
+@pytest.mark.slow
 def test_every_claim_is_judged(measured):
     found = {c["claim"]: c["verdict"] for c in judged_claims(SCENARIO, measured)}
     assert len(found) == len(SCENARIO.claims)
