@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.mean_density import fit_mean_density, sample_mean_density
 from track_fusion.densities.mixture.algebra import LogMixture, product
+from track_fusion.densities.mixture.mean_density import fit_mean_density, sample_mean_density
 from track_fusion.densities.mixture.mixture import Mixture, chosen, moments, same, stacked
 from track_fusion.linalg import Array, matvec, outer, transpose
 from track_fusion.params import param
