@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.linalg import ASYMMETRY_TOLERANCE, Array, is_positive_definite, outer, symmetrise, transpose
+from track_fusion.linalg import ASYMMETRY_TOLERANCE, Array, is_positive_definite, merged_moments, symmetrise, transpose
 
 #: Times are integers of nanoseconds.
 SECOND_NS = 1_000_000_000
@@ -286,10 +286,7 @@ class TrackBatch:
         """Mean (N, n) and covariance (N, n, n) of each track, its mixture merged."""
         if self.components == 1:
             return self.mean[:, 0], self.cov[:, 0]
-        weight = self.weight / self.weight.sum(1, keepdims=True)
-        mean = np.einsum("nc,nci->ni", weight, self.mean)
-        spread = self.cov + outer(self.mean - mean[:, None])
-        return mean, np.einsum("nc,ncij->nij", weight, spread)
+        return merged_moments(self.mean, self.cov, self.weight / self.weight.sum(1, keepdims=True))
 
 
 _ROW_FIELDS = ("weight", "mean", "cov", "time_ns", "track_id", "source", "status", "existence", "dof")

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from track_fusion.densities.gaussian import merge, merge_near
+from track_fusion.densities.gaussian import merge_near
 from track_fusion.densities.mixture.algebra import average
-from track_fusion.linalg import Array
+from track_fusion.linalg import Array, merged_moments
 from track_fusion.params import Params, param
 from track_fusion.rules.base import FusedTracks, Mixture, Rule, SourceTracks, check_weights
 from track_fusion.solvers.optimise import Solution
@@ -86,7 +86,7 @@ def fuse(tracks: SourceTracks, params: ArithmeticAverageParams) -> FusedTracks:
         found = _sought(tracks, params.criterion)
         weights = found.weights.reshape(*batch, count)
         info = {"converged": found.converged.reshape(batch), "iterations": found.iterations.reshape(batch)}
-    mean, cov = merge(tracks.mean, tracks.cov, weights)
+    mean, cov = merged_moments(tracks.mean, tracks.cov, weights)
     mixture = None
     if params.output == "mixture":
         mixture = _mixture(tracks, weights)
@@ -114,7 +114,7 @@ def _sought(tracks: SourceTracks, criterion: str) -> Solution:
 def _target_slopes(tracks: SourceTracks) -> Array:
     """Linear part of (39), (..., K): tr(P^-1 (P_i + (x_i - x)(x_i - x)')) for a target of moments x, P."""
     target: Mixture = tracks.extras["target"]
-    mean, cov = merge(target.mean, target.cov, target.weight / target.weight.sum(-1, keepdims=True))
+    mean, cov = merged_moments(target.mean, target.cov, target.weight / target.weight.sum(-1, keepdims=True))
     offset = tracks.mean - mean[..., None, :]
     second = tracks.cov + offset[..., :, None] * offset[..., None, :]
     slopes = np.trace(np.linalg.solve(cov[..., None, :, :], second), axis1=-2, axis2=-1)

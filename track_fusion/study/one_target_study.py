@@ -12,7 +12,7 @@ from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate, armse, rmse
 from track_fusion.rules import FusedTracks
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.one_target import Row, Sample, drawn
+from track_fusion.study.one_target import Row, drawn
 from track_fusion.study.scenario import Progress, RuleChoice, Samples, Tracking, check_needs, chosen
 
 TRUTH = "truth/position_m"
@@ -78,19 +78,18 @@ class OneTargetStudy:
         return self._run(chosen(self.rows, only), runs, seed, progress)
 
     def _run(self, rows: Mapping[str, Row], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
-        truth, sample = drawn(self.tracking, runs, seed)
-        found: Samples = {TRUTH: np.ascontiguousarray(truth[..., self.quantities[0].axes])}
+        draws = drawn(self.tracking, runs, seed)
+        samples: Samples = {TRUTH: np.ascontiguousarray(draws.truth[..., self.quantities[0].axes])}
         for done, (name, row) in enumerate(rows.items()):
             kept, step = self._empty(name, len(runs)), row.chunk or len(runs)
-            found |= {f"{name}/{key}": array for key, array in kept.items()}
+            samples |= {f"{name}/{key}": array for key, array in kept.items()}
             for begin in range(0, len(runs), step):
                 part = slice(begin, min(begin + step, len(runs)))
-                piece = Sample(seed, runs[part], [z[part] for z in sample.seen])
-                for k, fused in enumerate(row.estimates(piece)):
-                    self._keep({key: a[part, k] for key, a in kept.items()}, fused, truth[part, k + 1])
+                for k, fused in enumerate(row.estimates(draws.part(part))):
+                    self._keep({key: a[part, k] for key, a in kept.items()}, fused, draws.truth[part, k + 1])
                     share = (begin + (part.stop - begin) * (k + 1) / self.tracking.steps) / len(runs)
                     progress((done + share) / len(rows))
-        return found
+        return samples
 
     def _empty(self, row: str, runs: int) -> Samples:
         shapes = {q.error: (len(q.axes),) for q in self.quantities} | {CLAIMED: ()}
@@ -117,10 +116,10 @@ class OneTargetStudy:
         """
         check_needs(rules)
         name, row = self.compared
-        found = self._run({f"{name}-{choice.name}": row(choice) for choice in rules}, runs, seed, progress)
+        samples = self._run({f"{name}-{choice.name}": row(choice) for choice in rules}, runs, seed, progress)
         return {
             f"{name}-{choice.name}/{q.name}_rmse_{q.unit}": np.sqrt(
-                _squares(found[f"{name}-{choice.name}/{q.error}"]).mean(1)
+                _squares(samples[f"{name}-{choice.name}/{q.error}"]).mean(1)
             )
             for choice in rules
             for q in self.quantities
@@ -133,16 +132,16 @@ class OneTargetStudy:
         is the claimed variance over the squared error, each averaged over runs and steps: 1 = the truth, below =
         overconfident.
         """
-        found: dict[str, Estimate] = {}
+        estimates: dict[str, Estimate] = {}
         for row in _rows(samples):
             for q in self.quantities:
-                found[f"{row}/{q.armse}"] = armse(_squares(samples[f"{row}/{q.error}"]))
+                estimates[f"{row}/{q.armse}"] = armse(_squares(samples[f"{row}/{q.error}"]))
             claimed, squares = samples[f"{row}/{CLAIMED}"], self._position_squares(samples, row)
-            found[f"{row}/position_claimed_m"] = armse(claimed)
-            found[f"{row}/position_credibility_1"] = Estimate.ratio(claimed.mean(1), squares.mean(1))
+            estimates[f"{row}/position_claimed_m"] = armse(claimed)
+            estimates[f"{row}/position_credibility_1"] = Estimate.ratio(claimed.mean(1), squares.mean(1))
             if f"{row}/{WEIGHT}" in samples:
-                found |= _weight_figures(row, samples[f"{row}/{WEIGHT}"])
-        return found
+                estimates |= _weight_figures(row, samples[f"{row}/{WEIGHT}"])
+        return estimates
 
     def _position_squares(self, samples: Samples, row: str) -> Array:
         return _squares(samples[f"{row}/{self.quantities[0].error}"])
@@ -153,11 +152,11 @@ class OneTargetStudy:
         for row in _rows(samples):
             if _rule(row) not in NOT_DRAWN:
                 filters.setdefault(row.partition("-")[0], []).append(row)
-        found = [self._course(name, rows, samples) for name, rows in filters.items()]
-        found += [self._errors(name, q, rows, samples) for q in self.quantities for name, rows in filters.items()]
-        found += [self._credibility(name, rows, samples) for name, rows in filters.items()]
+        charts = [self._course(name, rows, samples) for name, rows in filters.items()]
+        charts += [self._errors(name, q, rows, samples) for q in self.quantities for name, rows in filters.items()]
+        charts += [self._credibility(name, rows, samples) for name, rows in filters.items()]
         averages = [row for row in _rows(samples) if _rule(row) == "arithmetic_average"]
-        return found + ([_weights(averages, samples)] if averages else [])
+        return charts + ([_weights(averages, samples)] if averages else [])
 
     def _course(self, name: str, rows: Iterable[str], samples: Samples) -> Chart:
         """Draw the first run's course by the paper's own rows."""

@@ -8,21 +8,18 @@ matching, and feeding back a fused scatter, then change no number.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from track_fusion.filters import gaussian_student_t_mixture, student_t
-from track_fusion.filters.student_t import cov_from_scatter, scatter_from_cov
+from track_fusion.filters.gaussian_student_t_mixture import GaussianStudentTMixture
+from track_fusion.filters.student_t import StudentT, StudentTParams
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate, armse, rmse
-from track_fusion.models.base import Sensor, Transition
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.noise import Noise
-from track_fusion.random_streams import stream
-from track_fusion.rules import RULES, FusedTracks
+from track_fusion.rules import FusedTracks
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.fast_covariance_intersection import FastCovarianceIntersectionParams
 from track_fusion.rules.geodesic_projection import GeodesicProjectionParams
@@ -30,6 +27,7 @@ from track_fusion.rules.mhdp_explicit import MhdpExplicitParams
 from track_fusion.rules.mhdp_iterative import MhdpIterativeParams
 from track_fusion.rules.quasi_minimal_manhattan import QuasiMinimalManhattanParams
 from track_fusion.study.chart import Chart, Series
+from track_fusion.study.one_target import drawn, fused_row, same_filters
 from track_fusion.study.scenario import (
     Claim,
     Progress,
@@ -39,7 +37,6 @@ from track_fusion.study.scenario import (
     Tracking,
     check_needs,
     chosen,
-    fuse_runs,
 )
 from track_fusion.tracks import StateLayout
 
@@ -86,35 +83,10 @@ def for_filter(base: Tracking, name: str) -> Tracking:
     return dataclasses.replace(base, measurement_noise=noise)
 
 
-class RobustFilter(NamedTuple):
-    """A filter of means and covariances (not scatters): predict and update, which also returns what it learned."""
-
-    predict: Callable[[Array, Array, Transition], tuple[Array, Array]]
-    update: Callable[[Array, Array, Array, Sensor], tuple[Array, Array, Any]]
-
-
-def student_t_update(
-    mean: Array, cov: Array, z: Array, sensor: Sensor
-) -> tuple[Array, Array, student_t.StudentInnovation]:
-    """Update of the Student-t filter; the dof is set back to 3, which keeps mean and covariance."""
-    mean, cov, _, innovation = student_t.update(mean, cov, DOF, z, sensor)
-    return mean, cov, innovation
-
-
-def mixture_update(
-    mean: Array, cov: Array, z: Array, sensor: Sensor
-) -> tuple[Array, Array, gaussian_student_t_mixture.Robustness]:
-    """Update of the Gaussian-Student-t-mixture filter, whose nominal matrices and result are scatters of t(3)."""
-    assert isinstance(sensor, LinearSensor)
-    nominal = dataclasses.replace(sensor, noise=sensor.noise / KAPPA)
-    mean, scatter, robustness = gaussian_student_t_mixture.update(mean, scatter_from_cov(cov, DOF), z, nominal)
-    return mean, cov_from_scatter(scatter, DOF), robustness
-
-
-#: The filters of Table 1. Both predict as the Kalman filter does.
+#: The filters of Table 1. Both predict as the Kalman filter does; nominal matrices are scatters of t(3) in both.
 FILTERS = {
-    "stf": RobustFilter(student_t.predict, student_t_update),
-    "gstm": RobustFilter(gaussian_student_t_mixture.predict, mixture_update),
+    "stf": same_filters(StudentT(StudentTParams(dof=DOF))),
+    "gstm": same_filters(GaussianStudentTMixture(dof=DOF)),
 }
 
 #: The rules of Table 1 in its order, and MHDP-E with the criterion as printed.
@@ -158,20 +130,9 @@ ASSUMPTIONS = (
 
 
 def fusions(base: Tracking, name: str, choice: RuleChoice, seed: int, runs: Sequence[int]) -> Iterator[FusedTracks]:
-    """Yield what a rule fuses at each step, fed back to one filter a sensor; mean (R, n), cov (R, n, n)."""
-    met, one = for_filter(base, name), FILTERS[name]
-    seen = [met.measurements(states, seed, run) for states, run in zip(met.truths(seed, runs), runs, strict=True)]
-    stacked = {sensor: np.stack([z[sensor] for z in seen], 1) for sensor in met.sensors}
-    mean = np.tile(met.initial_mean, (len(runs), 1))
-    cov = np.tile(met.initial_cov, (len(runs), 1, 1))
-    rngs = [stream(seed, run, "fusion_centre") for run in runs]
-    for k in range(met.steps):
-        mean, cov = one.predict(mean, cov, met.motion.over(met.dt_s))
-        local = [one.update(mean, cov, stacked[key][k], sensor)[:2] for key, sensor in met.sensors.items()]
-        means, covs = (np.stack(parts, 1) for parts in zip(*local, strict=True))
-        fused = fuse_runs(RULES[choice.key], choice.params, means, covs, rngs, DOF)
-        mean, cov = fused.mean, fused.cov
-        yield fused
+    """What a rule fuses at each step, fed back to one filter a sensor; mean (R, n), cov (R, n, n)."""
+    met = for_filter(base, name)
+    return fused_row(met, FILTERS[name], choice).estimates(drawn(met, runs, seed))
 
 
 #: A row of Table 1: which filter, and the rule.

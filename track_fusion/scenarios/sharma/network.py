@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from track_fusion.filters.base import Gaussian
 from track_fusion.linalg import Array, outer
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.metrics.consistency import nees
@@ -36,19 +37,15 @@ TRACE_WEIGHTS = (
 )
 
 
-class Tracks(NamedTuple):
-    """One node's estimate in R runs: mean (R, n), cov (R, n, n), or (1, n, n) where all runs have the same."""
-
-    mean: Array
-    cov: Array
-
-
 class Local(NamedTuple):
-    """R runs before anything is sent: state (R, n), estimate of each node, and of one filter that saw all."""
+    """R runs before anything is sent: state (R, n), estimate of each node, and of one filter that saw all.
+
+    Estimates have mean (R, n), cov (R, n, n), or (1, n, n) where all runs have the same.
+    """
 
     state: Array
-    nodes: Mapping[str, Tracks]
-    centralised: Tracks
+    nodes: Mapping[str, Gaussian]
+    centralised: Gaussian
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,20 +63,20 @@ class Network:
     rounds: tuple[Round, ...]
     sink: str
 
-    def fused(self, local: Local, choice: RuleChoice, rngs: Sequence[np.random.Generator] | None = None) -> Tracks:
+    def fused(self, local: Local, choice: RuleChoice, rngs: Sequence[np.random.Generator] | None = None) -> Gaussian:
         """Send estimates through the network, fused by a rule; return the sink's.
 
         A rule that samples draws from each run's generator in `rngs`.
         """
 
-        def fuse(own: Tracks, heard: Tracks, common: Tracks | None, count: int) -> Tracks:
+        def fuse(own: Gaussian, heard: Gaussian, common: Gaussian | None, count: int) -> Gaussian:
             size = max(len(own.cov), len(heard.cov))
             covs = [np.broadcast_to(t.cov, (size, *t.cov.shape[1:])) for t in (own, heard)]
             means = np.stack([own.mean, heard.mean], 1)
             fused = fuse_runs(RULES[choice.key], choice.params, means, np.stack(covs, 1), rngs)
-            return Tracks(fused.mean, fused.cov)
+            return Gaussian(fused.mean, fused.cov)
 
-        peers = {name: Peer(tracks) for name, tracks in local.nodes.items()}
+        peers = {name: Peer(estimate) for name, estimate in local.nodes.items()}
         for sent in self.rounds:
             peers = communicate(peers, sent, fuse)
         return peers[self.sink].density
