@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from oracles.kalman import predict, update
 from scipy.stats import chi2
 
 from track_fusion.centre.centre import FusionCentre, FusionCentreParams
 from track_fusion.centre.track_manager import TrackManagerParams
-from track_fusion.filters.kalman import predict, update
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
 from track_fusion.params import ParameterError

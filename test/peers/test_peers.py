@@ -5,12 +5,12 @@ from functools import partial
 
 import numpy as np
 import pytest
+from oracles.kalman import predict, update
 
 import track_fusion.peers.peer
 from track_fusion.densities.mixture.algebra import LogMixture, product
 from track_fusion.densities.mixture.divergence import grid, kl_on_grid
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf
-from track_fusion.filters.kalman import predict, update
 from track_fusion.peers.peer import Peer, Schedule, by_rule, communicate, gaussian, on_tree, ring, star, sweep
 from track_fusion.rules import RULES
 from track_fusion.rules.mixture_exact import MixtureExactParams

@@ -127,13 +127,13 @@ class ProbabilisticDataAssociation:
         scatter = transpose(part * residual) @ residual - outer(shift)
         mixed = missed * cov + (1.0 - missed) * joseph(cov, gain, slope, sensor.noise)
         posterior = symmetrise(mixed + gain @ scatter @ transpose(gain))
-        existence = _existence(state.existence, log_ratio)
+        existence = update_existence(state.existence, log_ratio)
         updated = dataclasses.replace(state, mean=mean + matvec(gain, shift), cov=posterior, existence=existence)
         return updated, Association(weight, gated, log_ratio)
 
     def missed(self, state: C) -> C:
         """Update by a scan without a detection in the gate, which leaves mean and covariance as they are."""
-        return dataclasses.replace(state, existence=_existence(state.existence, np.array(_missed(self.params))))
+        return dataclasses.replace(state, existence=update_existence(state.existence, np.array(_missed(self.params))))
 
 
 def _weights(
@@ -154,7 +154,7 @@ def _missed(params: ClutterParams) -> float:
         return float(np.log1p(-params.detection_probability * params.gate_probability))
 
 
-def _existence(existence: Array, log_ratio: Array) -> Array:
-    """Existence probability (...) after a scan of this log-likelihood ratio."""
+def update_existence(existence: Array, log_ratio: Array) -> Array:
+    """Existence probability (...) after a scan of this log-likelihood ratio, target there against not there."""
     ratio = np.exp(np.minimum(log_ratio, 700.0))
     return np.asarray(existence * ratio / (1.0 - existence + existence * ratio))

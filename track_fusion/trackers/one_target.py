@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -79,18 +80,9 @@ class _OfDetection:
     sensor: Sensor
     noise: Array
 
-    @property
-    def axes(self) -> tuple[str, ...]:
-        return self.sensor.axes
-
-    def observe(self, state: Array) -> Array:
-        return self.sensor.observe(state)
-
-    def jacobian(self, state: Array) -> Array:
-        return self.sensor.jacobian(state)
-
-    def residual(self, z: Array, expected: Array) -> Array:
-        return self.sensor.residual(z, expected)
+    def __getattr__(self, name: str) -> Any:
+        """All else is the sensor's."""
+        return getattr(self.sensor, name)
 
 
 class SensorTracker:
