@@ -64,13 +64,13 @@ def truths(runs: Sequence[int], seed: int, steps: int = STEPS) -> Array:
 
 def measurements(states: Array, runs: Sequence[int], seed: int) -> dict[str, Array]:
     """Draw ranges and range rates at steps 1 to T, (R, T, 2) for each platform."""
-    found = {}
+    seen = {}
     for name, sensor in SENSORS.items():
         draws = np.stack(
             [stream(seed, run, f"platform {name}").standard_normal((states.shape[1] - 1, 2)) for run in runs]
         )
-        found[name] = sensor.observe(states[:, 1:]) + draws * np.sqrt(np.diagonal(sensor.noise))
-    return found
+        seen[name] = sensor.observe(states[:, 1:]) + draws * np.sqrt(np.diagonal(sensor.noise))
+    return seen
 
 
 def prior(runs: Sequence[int], seed: int) -> MixtureModes:

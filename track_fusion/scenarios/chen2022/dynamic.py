@@ -149,12 +149,12 @@ def squared_errors(
 ) -> Samples:
     """Squared position errors of every row, (R, T), over the same Monte Carlo runs."""
     truth = base.truths(seed, runs)[:, :, LAYOUT.position]
-    found = {row: np.empty((len(runs), base.steps)) for row in table}
+    squares = {row: np.empty((len(runs), base.steps)) for row in table}
     for done, (row, (name, choice)) in enumerate(table.items()):
         for k, fused in enumerate(fusions(base, name, choice, seed, runs)):
-            found[row][:, k] = ((fused.mean[:, LAYOUT.position] - truth[:, k + 1]) ** 2).sum(-1)
+            squares[row][:, k] = ((fused.mean[:, LAYOUT.position] - truth[:, k + 1]) ** 2).sum(-1)
             progress((done + (k + 1) / base.steps) / len(table))
-    return found
+    return squares
 
 
 def compared(
@@ -167,19 +167,19 @@ def compared(
     ParameterError    a rule needs more than the tracks
     """
     check_needs(choices)
-    found = squared_errors(base, rows(choices), runs, seed, progress)
-    return {f"{row}/position_rmse_m": np.sqrt(squares.mean(1)) for row, squares in found.items()}
+    errors = squared_errors(base, rows(choices), runs, seed, progress)
+    return {f"{row}/position_rmse_m": np.sqrt(squares.mean(1)) for row, squares in errors.items()}
 
 
 def figures(samples: Samples) -> dict[str, Estimate]:
     """ARMSE of each row, and by how much it exceeds that of MHDP-E with the same filter, the runs being paired."""
-    found = {f"{row}/{FIGURE}": armse(squares) for row, squares in samples.items()}
+    estimates = {f"{row}/{FIGURE}": armse(squares) for row, squares in samples.items()}
     for row, squares in samples.items():
         reference = f"{row.partition('-')[0]}-{MHDP_E}"
         if row != reference and reference in samples:
             pair = np.stack([squares, samples[reference]], -1)
-            found[f"{row}/{EXCESS}"] = Estimate.of_averages(pair, _excess)
-    return found
+            estimates[f"{row}/{EXCESS}"] = Estimate.of_averages(pair, _excess)
+    return estimates
 
 
 def _excess(mean: Array) -> Array:
@@ -190,17 +190,17 @@ def _excess(mean: Array) -> Array:
 
 def charts(samples: Samples) -> list[Chart]:
     """Position RMSE over the steps, one chart a filter; DCI, far above, is left out as in Fig. 3."""
-    found = []
+    panels = []
     for name in FILTERS:
         lines = {row: squares for row, squares in samples.items() if row.startswith(f"{name}-")}
-        drawn = [
+        series = [
             Series(row.partition("-")[2], np.arange(1, squares.shape[1] + 1), rmse(squares))
             for row, squares in lines.items()
             if row != f"{name}-{DCI}" or len(lines) == 1
         ]
-        if drawn:
-            found.append(Chart(f"{name.upper()}: position RMSE", "step", "RMSE / m", tuple(drawn)))
-    return found
+        if series:
+            panels.append(Chart(f"{name.upper()}: position RMSE", "step", "RMSE / m", tuple(series)))
+    return panels
 
 
 def claims(name: str, printed: Mapping[str, float]) -> list[Claim]:
@@ -215,7 +215,7 @@ def claims(name: str, printed: Mapping[str, float]) -> list[Claim]:
 
     others = (DCI, GP, FCI, KLA, QMMHD)
     second, *rest = sorted(others[1:], key=printed.__getitem__)
-    found = [
+    statements = [
         Claim(f"{label}: MHDP-E has clearly lower errors than DCI, GP, FCI, KLA and QMMHD", "5.2, Fig. 3, Table 1",
               tuple(f"{name}-{rule}/{EXCESS}" for rule in others), clear),
         Claim.least(f"{label}: {SHORT[second]} comes next, before {', '.join(SHORT[rule] for rule in rest)}",
@@ -224,8 +224,9 @@ def claims(name: str, printed: Mapping[str, float]) -> list[Claim]:
     ]  # fmt: skip
     if name == "gstm":
         text = f"{label}: MHDP-I is slightly, but clearly better than MHDP-E"
-        found.append(Claim(text, "5.2", (f"{name}-{MHDP_I}/{EXCESS}",), lambda e: e.value < -CLEAR * e.standard_error))
-    return found
+        names = (f"{name}-{MHDP_I}/{EXCESS}",)
+        statements.append(Claim(text, "5.2", names, lambda e: e.value < -CLEAR * e.standard_error))
+    return statements
 
 
 def scenario(key: str, title: str, base: Tracking, table: Mapping[str, Sequence[float]], runs: int) -> Scenario:

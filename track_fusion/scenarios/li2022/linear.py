@@ -88,7 +88,7 @@ _OTHERS = ("alone", "ic", AVERAGE, INTERSECTION, "covariance_union")
 
 
 def _claims() -> tuple[Claim, ...]:
-    found = [
+    claims = [
         Claim.least(
             "KF with both sensors' measurements (IC) is the best row of all",
             "IV-A",
@@ -111,7 +111,7 @@ def _claims() -> tuple[Claim, ...]:
     for one in ("kf", "sir"):
         name = one.upper()
         ic, average, intersection = named(POSITION, one, "ic", AVERAGE, INTERSECTION)
-        found += [
+        claims += [
             Claim.greatest(
                 f"{name} with naive fusion is the worst row, worse than sensor 1 alone",
                 "IV-A",
@@ -130,7 +130,7 @@ def _claims() -> tuple[Claim, ...]:
             *union_claims(one, "IV-A"),
             *balance_claims(one, "IV-A"),
         ]
-    return (*found, *weight_claims("kf", "IV-A, Fig. 6"))
+    return (*claims, *weight_claims("kf", "IV-A, Fig. 6"))
 
 
 SCENARIO = Scenario(

@@ -95,7 +95,7 @@ LOST = 3.0
 def _claims() -> tuple[Claim, ...]:
     first, last = named("sensor_1_weight_first_1", "ckf", AVERAGE), named("sensor_1_weight_last_1", "ckf", AVERAGE)
     but_ic = ("alone", "naive", AVERAGE, INTERSECTION, UNION)
-    found = [
+    claims = [
         Claim.order(
             "SIR with both sensors' measurements (IC) is worse than CKF-IC, and even than SIR with covariance union",
             "IV-B",
@@ -114,13 +114,13 @@ def _claims() -> tuple[Claim, ...]:
     ]
     for rule in (AVERAGE, INTERSECTION):
         names = [f"{one}-{rule}/{POSITION}" for one in ("ckf", "sir")]
-        found.append(
+        claims.append(
             close(f"particles do not degenerate under {rule}: SIR is within 8 % of CKF", "IV-B", CLOSE, *names)
         )
     for one in ("ckf", "sir"):
         name, naive = one.upper(), f"{one}-naive/{POSITION}"
         best = named(POSITION, one, AVERAGE, INTERSECTION)
-        found += [
+        claims += [
             Claim.greatest(
                 f"{name} with naive fusion loses the target: three times the error of every other row",
                 "IV-B, Fig. 7",
@@ -151,7 +151,7 @@ def _claims() -> tuple[Claim, ...]:
             *union_claims(one, "IV-B"),
             *balance_claims(one, "IV-B"),
         ]
-    return tuple(found)
+    return tuple(claims)
 
 
 SCENARIO = Scenario(

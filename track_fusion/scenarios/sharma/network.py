@@ -107,25 +107,25 @@ def sample(
     """
     wanted = chosen({row_name(row, reading): (reading, c) for reading in readings for row, c in ROWS.items()}, only)
     local = {reading: readings[reading].estimate(runs, seed) for reading in {r for r, _ in wanted.values()}}
-    found: Samples = {}
+    samples: Samples = {}
     for done, (name, (reading, choice)) in enumerate(wanted.items()):
         start = local[reading]
         fused = start.centralised if choice is None else readings[reading].fused(start, choice)
-        found[f"{name}/error"] = fused.mean - start.state
-        found[f"{name}/cov"] = np.broadcast_to(fused.cov, (len(runs), *fused.cov.shape[1:]))
+        samples[f"{name}/error"] = fused.mean - start.state
+        samples[f"{name}/cov"] = np.broadcast_to(fused.cov, (len(runs), *fused.cov.shape[1:]))
         progress((done + 1) / len(wanted))
-    return found
+    return samples
 
 
 def figures(samples: Samples) -> dict[str, Estimate]:
     """Trace of the covariance reported and of the errors' own, and NEES over the number of axes."""
-    found = {}
+    estimates = {}
     for name in _rows(samples):
         error, cov = samples[f"{name}/error"], samples[f"{name}/cov"]
-        found[f"{name}/reported_trace_1"] = Estimate.mean(np.trace(cov, axis1=1, axis2=2))
-        found[f"{name}/sample_trace_1"] = Estimate.mean((error**2).sum(1))
-        found[f"{name}/nees_1"] = Estimate.mean(nees(error, cov) / error.shape[1])
-    return found
+        estimates[f"{name}/reported_trace_1"] = Estimate.mean(np.trace(cov, axis1=1, axis2=2))
+        estimates[f"{name}/sample_trace_1"] = Estimate.mean((error**2).sum(1))
+        estimates[f"{name}/nees_1"] = Estimate.mean(nees(error, cov) / error.shape[1])
+    return estimates
 
 
 def _rows(samples: Samples) -> list[str]:
@@ -139,12 +139,12 @@ def charts(readings: Mapping[str, str], samples: Samples) -> list[Chart]:
     ----------
     readings : reading -> what to call it in titles
     """
-    found = []
+    panels = []
     for reading, title in readings.items():
         for labels in PICTURES:
             lines = [line for row in labels for line in _ellipses(samples, row, reading, labels[row])]
             if lines:
-                found.append(Chart(f"{title}, 2 sigma", "x", "y", tuple(lines), equal=True))
+                panels.append(Chart(f"{title}, 2 sigma", "x", "y", tuple(lines), equal=True))
     measured = figures(samples)
     bars = {_label(name): measured[f"{name}/nees_1"] for name in _rows(samples)}
     place = np.arange(len(bars), dtype=float)
@@ -154,7 +154,7 @@ def charts(readings: Mapping[str, str], samples: Samples) -> list[Chart]:
         Series("consistent", place[[0, -1]], np.ones(2), "dashed"),
     )
     ticks = dict(zip(place.tolist(), bars, strict=True))
-    return [*found, Chart("Squared errors over the covariance reported", "", "NEES / n", series, ticks=ticks)]
+    return [*panels, Chart("Squared errors over the covariance reported", "", "NEES / n", series, ticks=ticks)]
 
 
 def _label(name: str) -> str:

@@ -176,12 +176,12 @@ def judged(tracks: TrackBatch, truth: Array) -> Judged:
     at = list(LAYOUT.position)
     target, track = nearest_pairs(truth[:, at], mean[:, at], REACH_M)
     count = len(truth)
-    found = Judged(np.full((count, 2), np.nan), np.full(count, np.nan), np.full(count, np.nan),
+    kept = Judged(np.full((count, 2), np.nan), np.full(count, np.nan), np.full(count, np.nan),
                    np.array(float(len(mean) - len(track))))  # fmt: skip
-    found.position[target] = mean[track][:, at]
-    found.nees[target] = nees(mean[track] - truth[target], cov[track])
-    found.variance[target] = cov[track][:, at, at].sum(-1)
-    return found
+    kept.position[target] = mean[track][:, at]
+    kept.nees[target] = nees(mean[track] - truth[target], cov[track])
+    kept.variance[target] = cov[track][:, at, at].sum(-1)
+    return kept
 
 
 def judged_alone(scans: Mapping[int, TrackBatch], truth: Array) -> Judged:
