@@ -24,7 +24,7 @@ FLOORS: tuple[Mapping[str, str], ...] = (
         "scenarios": "one published study a folder",
         "report": "pages and pictures",
     },
-    {"study": "what a scenario is: runs, samples, figures, claims and verdicts"},
+    {"study": "what a scenario is: runs, outcomes, figures, claims and verdicts"},
     {"centre": "the fusion centre: a value and pure steps"},
     {"peers": "decentralised fusion"},
     {"trackers": "detections in, tracks out"},

@@ -93,7 +93,7 @@ def chen2022() -> Iterator[Case]:
         assert base is not None
         for rule in rules:
             one = choice(name, rule)
-            row = Row(lambda sample, base=base, one=one: fusions(base, "stf", one, sample.seed, sample.runs))  # type: ignore[misc]
+            row = Row(lambda draws, base=base, one=one: fusions(base, "stf", one, draws.seed, draws.runs))  # type: ignore[misc]
             parameters = {"covariance_intersection.criterion": "uniform"} if one.variant else {}
             yield Case(name, one.key, f"stf-{one.name}", row, parameters)
 
@@ -152,8 +152,8 @@ def test_the_nodes_give_the_numbers_of_the_library(
     assert tracking is not None
     step_ns, axes = round(tracking.dt_s * 1e9), tracking.motion.layout.axes
     assert [stamp_ns(m) for m in messages] == [k * step_ns for k in range(1, tracking.steps + 1)]
-    truth, sample = drawn(tracking, [RUN], SEED)
-    expected = np.array([fused.mean[0] for fused in case.library.estimates(sample)])
+    truth, draws = drawn(tracking, [RUN], SEED)
+    expected = np.array([fused.mean[0] for fused in case.library.estimates(draws)])
     estimated = np.array([merged(read(m), axes)[0][0] for m in messages])
     scale = np.abs(expected).max(0)
     np.testing.assert_allclose(estimated / scale, expected / scale, rtol=0, atol=TOLERANCE)
@@ -171,8 +171,8 @@ def compare_figures(case: Case, judged: dict[str, Any], error: NDArray[np.float6
     if not case.row:
         assert get_rule(case.rule or "").optional == ("seed",)
         return
-    samples = scenario.sample([RUN], SEED, lambda share: None, case.row)
-    own = {name.rpartition("/")[2]: e.value for name, e in scenario.figures(samples).items()
+    outcomes = scenario.simulate([RUN], SEED, lambda share: None, case.row)
+    own = {name.rpartition("/")[2]: e.value for name, e in scenario.figures(outcomes).items()
            if name.startswith(f"{case.row}/") and "_armse_" in name}  # fmt: skip
     assert own
     for quantity, value in own.items():
@@ -184,7 +184,7 @@ def test_radars_in_clutter_give_the_tracks_of_the_library(ros_context: Any, ros_
     """Every fusion depends on the one before: the centre fuses its own prediction, too."""
     pytest.importorskip("pymap3d")
     rule = "harmonic_mean"
-    case = Case(RADARS, rule, "", Row(lambda sample: iter(())), steps=RADAR_STEPS)
+    case = Case(RADARS, rule, "", Row(lambda draws: iter(())), steps=RADAR_STEPS)
     messages, judged = run(case, ros_context, ros_domain, tmp_path)
     own = sharma_radar_runs.centre(choice(RADARS, rule))
     fusions = sharma_radar_runs.local_tracks(SEED, RUN, lambda share: None)
@@ -203,7 +203,7 @@ def test_radars_in_clutter_give_the_tracks_of_the_library(ros_context: Any, ros_
             np.testing.assert_allclose(
                 getattr(table, field), want, rtol=0, atol=TOLERANCE * np.abs(want).max(initial=1.0)
             )
-    truth = sharma_radar_runs.scene().truth(SEED, RUN)[:: sharma_radar_runs.FUSION_SCANS][1 : len(messages) + 1]
+    truth = sharma_radar_runs.scene().states(SEED, RUN)[:: sharma_radar_runs.FUSION_SCANS][1 : len(messages) + 1]
     of_step = [sharma_radar_runs.judged(tracks, states) for (tracks, _), states in zip(expected, truth, strict=True)]
     found_targets = sum(int(np.isfinite(step.nees).sum()) for step in of_step)
     assert (judged["times"], judged["all"]["samples"]) == (len(messages), found_targets)

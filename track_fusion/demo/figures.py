@@ -29,11 +29,11 @@ def library(demo: Demo, rows: list[str], progress: Callable[[float], None]) -> t
             progress((done + share) / len(wanted))
 
         try:
-            samples = demo.scenario.sample(range(demo.library_runs), demo.seed, part, only)
+            outcomes = demo.scenario.simulate(range(demo.library_runs), demo.seed, part, only)
         except ParameterError:
             continue
         for measured, runs in ((same, 1), (many, demo.library_runs)):
-            measured |= demo.scenario.figures({name: array[:runs] for name, array in samples.items()})
+            measured |= demo.scenario.figures({name: array[:runs] for name, array in outcomes.items()})
     progress(1.0)
     return same, many
 

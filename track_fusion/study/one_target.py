@@ -23,7 +23,8 @@ from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.covariance_union import CovarianceUnionParams
 from track_fusion.rules.naive import NaiveParams
-from track_fusion.study.scenario import RuleChoice, Tracking, fuse_runs
+from track_fusion.study.rule_choice import RuleChoice, fuse_runs
+from track_fusion.study.scene import Tracking
 
 #: Particles of so many runs are worked on at once: larger arrays leave the cache.
 SIR_CHUNK = 50
@@ -51,7 +52,7 @@ class GaussianFilter(NamedTuple):
     update: GaussianUpdate
 
 
-class Sample(NamedTuple):
+class Draws(NamedTuple):
     """Monte Carlo runs: which, and what each sensor saw in them, (R, T, m) each."""
 
     seed: int
@@ -66,7 +67,7 @@ class Row(NamedTuple):
     (R, K) or (1, K).
     """
 
-    estimates: Callable[[Sample], Iterator[FusedTracks]]
+    estimates: Callable[[Draws], Iterator[FusedTracks]]
     chunk: int = 0
 
 
@@ -78,12 +79,12 @@ def start(tracking: Tracking, runs: int) -> tuple[Array, Array]:
 def gaussian_alone(tracking: Tracking, one: GaussianFilter, sensors: int) -> Row:
     """One filter that uses the first so many sensors, one after the other (IC)."""
 
-    def estimates(sample: Sample) -> Iterator[FusedTracks]:
+    def estimates(draws: Draws) -> Iterator[FusedTracks]:
         used = list(tracking.sensors.values())[:sensors]
-        mean, cov = start(tracking, len(sample.runs))
+        mean, cov = start(tracking, len(draws.runs))
         for k in range(tracking.steps):
             mean, cov = one.predict(mean, cov, tracking.motion.over(tracking.dt_s))
-            zs = [z[:, k] for z in sample.seen[:sensors]]
+            zs = [z[:, k] for z in draws.seen[:sensors]]
             mean, cov, _ = iterated_corrector.update(mean, cov, zs, used, one.update)
             yield FusedTracks(mean, cov)
 
@@ -93,23 +94,23 @@ def gaussian_alone(tracking: Tracking, one: GaussianFilter, sensors: int) -> Row
 def gaussian_fused(tracking: Tracking, one: GaussianFilter, choice: RuleChoice) -> Row:
     """One filter a sensor, fused after each step, the fused posterior fed back to all of them."""
 
-    def estimates(sample: Sample) -> Iterator[FusedTracks]:
-        rngs, (mean, cov) = fusion_streams(sample), start(tracking, len(sample.runs))
+    def estimates(draws: Draws) -> Iterator[FusedTracks]:
+        rngs, (mean, cov) = fusion_streams(draws), start(tracking, len(draws.runs))
         for k in range(tracking.steps):
             mean, cov = one.predict(mean, cov, tracking.motion.over(tracking.dt_s))
-            pairs = zip(sample.seen, tracking.sensors.values(), strict=True)
+            pairs = zip(draws.seen, tracking.sensors.values(), strict=True)
             local = [one.update(mean, cov, z[:, k], sensor)[:2] for z, sensor in pairs]
             means, covs = (np.stack(parts, 1) for parts in zip(*local, strict=True))
-            fused = fuse_runs(RULES[choice.key], choice.params, means, covs, rngs)
+            fused = fuse_runs(choice, means, covs, rngs)
             mean, cov = fused.mean, fused.cov
             yield fused
 
     return Row(estimates)
 
 
-def fusion_streams(sample: Sample) -> list[np.random.Generator]:
+def fusion_streams(draws: Draws) -> list[np.random.Generator]:
     """Return what a rule that samples draws from, a generator a run."""
-    return [stream(sample.seed, run, "fusion_centre") for run in sample.runs]
+    return [stream(draws.seed, run, "fusion_centre") for run in draws.runs]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,19 +121,19 @@ class Sir:
     resampling: str = "systematic"
 
 
-def _streams(sample: Sample, name: str) -> list[np.random.Generator]:
-    return [stream(sample.seed, run, f"sir {name}") for run in sample.runs]
+def _streams(draws: Draws, name: str) -> list[np.random.Generator]:
+    return [stream(draws.seed, run, f"sir {name}") for run in draws.runs]
 
 
 def sir_alone(tracking: Tracking, sir: Sir, sensors: int) -> Row:
     """One particle filter weighted by the first so many sensors (IC), resampled after every step."""
 
-    def estimates(sample: Sample) -> Iterator[FusedTracks]:
-        used, rng = list(tracking.sensors.values())[:sensors], _streams(sample, next(iter(tracking.sensors)))
-        cloud = particle.from_gaussian(*start(tracking, len(sample.runs)), rng, sir.count)
+    def estimates(draws: Draws) -> Iterator[FusedTracks]:
+        used, rng = list(tracking.sensors.values())[:sensors], _streams(draws, next(iter(tracking.sensors)))
+        cloud = particle.from_gaussian(*start(tracking, len(draws.runs)), rng, sir.count)
         for k in range(tracking.steps):
             cloud = particle.predict(cloud, tracking.motion.over(tracking.dt_s), rng)
-            for z, sensor in zip(sample.seen, used, strict=False):
+            for z, sensor in zip(draws.seen, used, strict=False):
                 cloud, _ = particle.update(cloud, z[:, k], sensor)
             yield FusedTracks(*particle.moments(cloud))
             cloud = particle.RESAMPLING[sir.resampling](cloud, rng, sir.count)
@@ -147,15 +148,15 @@ def sir_fused(tracking: Tracking, sir: Sir, choice: RuleChoice, union: bool = Fa
     themselves: the arithmetic average of their densities.
     """
 
-    def estimates(sample: Sample) -> Iterator[FusedTracks]:
-        streams = [_streams(sample, name) for name in tracking.sensors]
-        clouds = [particle.from_gaussian(*start(tracking, len(sample.runs)), rng, sir.count) for rng in streams]
+    def estimates(draws: Draws) -> Iterator[FusedTracks]:
+        streams = [_streams(draws, name) for name in tracking.sensors]
+        clouds = [particle.from_gaussian(*start(tracking, len(draws.runs)), rng, sir.count) for rng in streams]
         for k in range(tracking.steps):
             moved = [
                 particle.predict(cloud, tracking.motion.over(tracking.dt_s), rng)
                 for cloud, rng in zip(clouds, streams, strict=True)
             ]
-            triples = zip(moved, sample.seen, tracking.sensors.values(), strict=True)
+            triples = zip(moved, draws.seen, tracking.sensors.values(), strict=True)
             clouds = [particle.update(cloud, z[:, k], sensor)[0] for cloud, z, sensor in triples]
             fused = RULES[choice.key].fuse(_converted(tracking, clouds), choice.params)
             yield fused
@@ -195,8 +196,8 @@ def _drawn_again(
     return particle.RESAMPLING[sir.resampling](particle.union(clouds, fused.weights), rng, sir.count)
 
 
-def drawn(tracking: Tracking, runs: Sequence[int], seed: int) -> tuple[Array, Sample]:
+def drawn(tracking: Tracking, runs: Sequence[int], seed: int) -> tuple[Array, Draws]:
     """Draw the truth (R, T + 1, n) and the measurements of these Monte Carlo runs."""
     truth = tracking.truths(seed, runs)
     seen = [tracking.measurements(states, seed, run) for states, run in zip(truth, runs, strict=True)]
-    return truth, Sample(seed, runs, [np.stack([s[name] for s in seen]) for name in tracking.sensors])
+    return truth, Draws(seed, runs, [np.stack([s[name] for s in seen]) for name in tracking.sensors])

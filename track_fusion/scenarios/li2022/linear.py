@@ -10,7 +10,8 @@ from track_fusion.filters.kalman import predict, update, update_joint
 from track_fusion.linalg import Array
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
-from track_fusion.rules import RULES, FusedTracks
+from track_fusion.rules import FusedTracks
+from track_fusion.scenarios.li2022 import PAPER
 from track_fusion.scenarios.li2022.claims import (
     ASSUMPTIONS,
     AVERAGE,
@@ -28,9 +29,12 @@ from track_fusion.scenarios.li2022.claims import (
 from track_fusion.scenarios.li2022.claims import (
     RULES as ROWS,
 )
+from track_fusion.study.claims import Claim, Printed
 from track_fusion.study.one_target import RULE_CHOICES, Row, Sir, fusion_streams, sir_rows
 from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
-from track_fusion.study.scenario import Claim, Printed, RuleChoice, Scenario, Tracking, fuse_runs
+from track_fusion.study.rule_choice import RuleChoice, fuse_runs
+from track_fusion.study.scenario import Scenario
+from track_fusion.study.scene import Tracking
 from track_fusion.tracks import planar_layout
 
 #: Table I: ARMSE of position (m) and velocity (m/s).
@@ -89,20 +93,20 @@ def fused_filters(
 
     `rngs`: a generator a run, for a rule that samples.
     """
-    rule, sensors = RULES[choice.key], list(SENSORS.values())
+    sensors = list(SENSORS.values())
     mean, cov = _start(len(seen[0]))
     for k in range(TRACKING.steps):
         mean, cov = predict(mean, cov, *MOTION.matrices(TRACKING.dt_s))
         local = [update(mean, cov, z[:, k], s.matrix, s.noise)[:2] for z, s in zip(seen, sensors, strict=True)]
         means, covs = (np.stack(parts, 1) for parts in zip(*local, strict=True))
-        fused = fuse_runs(rule, choice.params, means, covs, rngs)
+        fused = fuse_runs(choice, means, covs, rngs)
         mean, cov = fused.mean, fused.cov
         yield fused
 
 
 def kalman_row(choice: RuleChoice) -> Row:
     """Two Kalman filters fused by any rule."""
-    return Row(lambda sample: fused_filters(choice, sample.seen, fusion_streams(sample)))
+    return Row(lambda draws: fused_filters(choice, draws.seen, fusion_streams(draws)))
 
 
 def kalman_rows() -> dict[str, Row]:
@@ -173,14 +177,14 @@ def _claims() -> tuple[Claim, ...]:
 SCENARIO = Scenario(
     key="li2022-linear",
     title="Two position sensors, one target, linear and Gaussian",
-    paper="Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average Density Fusion, IV-A",
+    paper=f"{PAPER}, IV-A",
     shows="what fusing with unknown correlation costs and gains when the fused posterior is fed back to both filters",
     published=published(TABLE_1, QUANTITIES) | SECTION_4A,
     published_runs=100,
     default_runs=150,
     publication_runs=1000,
     assumptions=ASSUMPTIONS,
-    sample=STUDY.sample,
+    simulate=STUDY.simulate,
     figures=STUDY.figures,
     charts=STUDY.charts,
     claims=_claims(),
