@@ -249,6 +249,15 @@ def test_a_scan_used_before_starts_nothing():
     assert len(fused) == 0
 
 
+def test_a_scan_used_before_uses_up_no_identifier():
+    fuser = centre(1, max_scan_age_s=10.0)
+    fuser.step(0, {0: tracks([[0, 0]], 0)})
+    fuser.state = dataclasses.replace(fuser.state, central=fuser.state.central[np.zeros(1, bool)])
+    _, info = fuser.step(SECOND, {})
+    assert info.changes.born.tolist() == info.changes.deleted.tolist() == []
+    assert fuser.step(2 * SECOND, {0: tracks([[0, 0]], 2 * SECOND)})[0].track_id.tolist() == [2]
+
+
 def test_tentative_and_coasted_source_tracks_by_parameter():
     batch = tracks([[0, 0], [50, 0], [100, 0]], 0, status=np.array([0, CONFIRMED, CONFIRMED | COASTED], np.uint8))
     xs = lambda **params: centre(**params).step(0, {0: batch})[0].mean[:, 0, 0].tolist()  # noqa: E731

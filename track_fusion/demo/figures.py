@@ -59,11 +59,5 @@ def figures(demo: Demo, over_ros: dict[str, dict[str, float]], same: Figures, ma
         row, _, quantity = name.rpartition("/")
         variant = f"{row},{demo.library_runs}-runs" if "@" in row else f"{row}@{demo.library_runs}-runs"
         listed.append({**figure, "name": f"library/{variant}/{quantity}"})
-    return {
-        "scenario": scenario.key,
-        "parameter_file": demo.name,
-        "runs": 1,
-        "seed": demo.seed,
-        "library_runs": demo.library_runs,
-        "figures": listed,
-    }
+    run = {"scenario": scenario.key, "parameter_file": demo.name, "runs": 1, "seed": demo.seed}
+    return {**run, "library_runs": demo.library_runs, "figures": listed}

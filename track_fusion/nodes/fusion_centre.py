@@ -23,9 +23,9 @@ from track_fusion.centre.config import (
     MAX_SOURCES,
     CentreConfig,
     FusionCentreParams,
-    RuleParams,
     ScanBufferParams,
     SourceConfig,
+    StateFusionParams,
     TrackManagerParams,
 )
 from track_fusion.centre.publish import StepInfo
@@ -94,7 +94,7 @@ class FusionCentreNode(ManagedNode):
         self.frame, self.sources = declare(self, FrameParams), declare(self, SourceParams)
         self.kinds = self.sources.kinds
         motion = chosen(self, MOTIONS, declare(self, MotionChoice).motion, StateLayout(self.frame.axes))
-        rule = RULES[declare(self, RuleParams).state_fusion]
+        rule = RULES[declare(self, StateFusionParams).state_fusion]
         rules = {**RULES.own, rule.key: rule}
         rule_params = {key: declare(self, each.params, f"{key}.") for key, each in rules.items()}
         names = zip(self.sources.source_configurations, self.kinds, strict=True)
@@ -196,7 +196,7 @@ class FusionCentreNode(ManagedNode):
         values: dict[str, Any] = {"rule": rule.key, "tracks": len(self.centre.tracks)}
         values["step_s"] = round(self._latency_s, 6)
         for k, name in enumerate(self.sources.source_configurations):
-            silence = self.centre.silence_s(k, self.now_ns())
+            silence = self.centre.buffer.silence_s(k, self.now_ns())
             values[f"silence_s/{name}"] = round(silence, 3)
             if silence >= timeout_s:
                 warnings.append(f"{name} is silent for {silence:.1f} s")

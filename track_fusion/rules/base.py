@@ -115,8 +115,8 @@ class Example:
     #: by how many standard deviations moments may vary with the random numbers, if every sample is effective; where
     #: parameters name a number of samples
     monte_carlo: float = 0.0
-    #: (rng, tracks) -> extras that the rule needs and that `contract.EXTRAS` does not know
-    extras: Callable[[np.random.Generator, SourceTracks], Mapping[str, Any]] | None = None
+    #: tracks -> extras that the rule needs and that `contract.EXTRAS` does not know; they must move with the tracks
+    extras: Callable[[SourceTracks], Mapping[str, Any]] | None = None
     #: for guarantee none or structural: the true error variance over the claimed one, measured and as stated
     counter_example: Callable[[], tuple[float, float]] | None = None
 
