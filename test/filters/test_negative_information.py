@@ -89,7 +89,7 @@ def test_moments_and_likelihood_against_a_grid(chance):
 @pytest.mark.parametrize("offset", [-3.0, 0.0, 6.0])
 def test_binary_likelihood_of_one_gaussian_against_quadrature(steepness, offset):
     """P(class 1 | x) = 1 / (1 + exp(-s (x - 1) ...)): each class' mass, mean and variance along one axis."""
-    detector = SoftmaxDetector.binary(np.array([steepness]), steepness * offset / 3.0)
+    detector = SoftmaxDetector(np.array([[0.0], [steepness]]), np.array([0.0, steepness * offset / 3.0]))
     prior = Mixture(np.ones(1), np.array([[0.5]]), np.array([[[2.0]]]))
     x = np.linspace(-15.0, 15.0, 60_001)
     normal = np.exp(-0.25 * (x - 0.5) ** 2) / np.sqrt(4 * np.pi) * (x[1] - x[0])

@@ -25,7 +25,7 @@ CKF = {
 
 def study(module, rows, runs, seed):
     part = dataclasses.replace(module.STUDY, rows={n: module.STUDY.rows[n] for n in rows})
-    return part.figures(part.sample(range(runs), seed, lambda share: None))
+    return part.figures(part.simulate(range(runs), seed, lambda share: None))
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def test_covariance_union_of_table_2_is_a_valid_bound_and_worse_than_the_average
 def test_the_union_of_least_determinant_keeps_the_turn_rate_in_bounds():
     """In this run the bound of least trace, in metres and radians at once, lets it grow to 10^4 deg/s."""
     part = dataclasses.replace(li2022_nonlinear.STUDY, rows={"u": li2022_nonlinear.STUDY.rows["sir-covariance_union"]})
-    errors = part.sample([219], 0, lambda share: None)["u/turn_rate_error_degps"]
+    errors = part.simulate([219], 0, lambda share: None)["u/turn_rate_error_degps"]
     assert np.abs(errors).max() < 15.0
 
 
@@ -94,11 +94,11 @@ def test_rows_do_not_depend_on_the_batch(module):
 
 @pytest.mark.parametrize("module", [li2022_linear, li2022_nonlinear])
 def test_rows_are_chosen_by_the_beginning_of_their_names(module):
-    found = module.SCENARIO.study(2, 0, only="sir-ic@")
+    found = module.SCENARIO.measure(2, 0, only="sir-ic@")
     wanted = [quantity.armse for quantity in module.QUANTITIES]
     assert list(found) == [f"sir-ic@multinomial/{q}" for q in (*wanted, "position_claimed_m", "position_credibility_1")]
     with pytest.raises(ValueError, match="Unknown row 'sir-ci'. Did you mean 'sir-ic'"):
-        module.SCENARIO.study(2, 0, only="sir-ci")
+        module.SCENARIO.measure(2, 0, only="sir-ci")
 
 
 def test_cubature_filters_under_rules_that_the_user_names():

@@ -31,15 +31,13 @@ class FusionCentre:
     Tell it of each scan by `receive` and of time by `advance`, and it decides when a step runs, as the node does; or
     decide yourself, and call `step`.
 
+    doc/fusion-centre.md has an example.
+
     Attributes
     ----------
     config : CentreConfig
     state : CentreState      a value: keep it, and set it again to go back
     buffer : ScanBuffer      likewise
-
-    Example
-    -------
-    doc/fusion-centre.md has one.
     """
 
     def __init__(self, config: CentreConfig) -> None:
@@ -73,7 +71,3 @@ class FusionCentre:
             if due is None:
                 return
             yield Published(due.time_ns, *self.step(due.time_ns, due.scans), due.superseded)
-
-    def silence_s(self, source: int, now_ns: int) -> float:
-        """Seconds since a source was last heard (or since the first scan of any); negative: nothing yet."""
-        return self.buffer.silence_s(source, now_ns)

@@ -16,7 +16,8 @@ from msg_adapters.odometry import odometry_to_msgs
 from msg_adapters.track_table import track_table_from_msg, track_table_to_msg
 from track_fusion.models.choices import MOTIONS, SENSORS
 from track_fusion.models.measurement import RangeBearingSensor
-from track_fusion.nodes.managed import ManagedNode, end, run
+from track_fusion.nodes.managed import ManagedNode
+from track_fusion.nodes.process import end, run
 from track_fusion.nodes.ros_params import chosen, declare
 from track_fusion.nodes.screening import FrameParams, screened_detections, screened_tracks
 from track_fusion.params import ParameterError, Params, param

@@ -18,12 +18,13 @@ from track_fusion.filters.particle import Particles, Sir, SirParams, union
 from track_fusion.linalg import Array
 from track_fusion.models.base import Transition
 from track_fusion.random_streams import stream
-from track_fusion.rules import RULES, FusedTracks
+from track_fusion.rules import FusedTracks
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.covariance_union import CovarianceUnionParams
 from track_fusion.rules.naive import NaiveParams
-from track_fusion.study.scenario import RuleChoice, Tracking, fuse_runs
+from track_fusion.study.rule_choice import RuleChoice, fuse_runs
+from track_fusion.study.scene import Tracking
 from track_fusion.trackers.fusion_loop import BatchTracker, filtered, fusion_loop
 
 #: Particles of so many runs are worked on at once: larger arrays leave the cache.
@@ -128,7 +129,7 @@ def fused_row(tracking: Tracking, filters: Filters, choice: RuleChoice, join: bo
 
         def fuse(states: Sequence[TrackState]) -> tuple[FusedTracks, Density]:
             means, covs = (np.stack(part, 1) for part in zip(*(_moments(tracking, s) for s in states), strict=True))
-            tracks = fuse_runs(RULES[choice.key], choice.params, means, covs, rngs, float(states[0].dof))
+            tracks = fuse_runs(choice, means, covs, rngs, float(states[0].dof))
             if not join:
                 return tracks, Gaussian(tracks.mean, tracks.cov)
             assert tracks.weights is not None

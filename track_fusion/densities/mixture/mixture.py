@@ -38,11 +38,7 @@ class Mixture:
 
     def take(self, index: NDArray[np.intp]) -> Mixture:
         """Pick components (..., P) of each mixture by index."""
-        return Mixture(
-            np.take_along_axis(self.weight, index, -1),
-            np.take_along_axis(self.mean, index[..., None], -2),
-            np.take_along_axis(self.cov, index[..., None, None], -3),
-        )
+        return Mixture(*(take_components(a, index) for a in (self.weight, self.mean, self.cov)))
 
     def at(self, key: Any) -> Mixture:
         """Index the leading axes of all three arrays alike."""
@@ -55,6 +51,22 @@ class Mixture:
             np.broadcast_to(self.mean, (*lead, *self.mean.shape[-2:])),
             np.broadcast_to(self.cov, (*lead, *self.cov.shape[-3:])),
         )
+
+
+def take_components(array: NDArray[Any], index: NDArray[np.intp]) -> NDArray[Any]:
+    """Pick components (..., P) of an array (..., C, ...) by index."""
+    return np.take_along_axis(array, component_index(array, index), index.ndim - 1)
+
+
+def component_index(array: NDArray[Any], index: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Give an index (..., P) of components as many axes as an array (..., C, ...) has."""
+    return index.reshape(*index.shape, *(1,) * (array.ndim - index.ndim))
+
+
+def gaussian(mean: Array, cov: Array) -> Mixture:
+    """Return a Gaussian as a mixture (..., 1), cov (..., n, n) broadcast to mean (..., n)."""
+    cov = np.broadcast_to(cov, (*mean.shape, mean.shape[-1]))
+    return Mixture(np.ones((*mean.shape[:-1], 1)), mean[..., None, :], cov[..., None, :, :])
 
 
 def moments(mixture: Mixture) -> tuple[Array, Array]:
@@ -93,10 +105,9 @@ class Factored:
     white: Array
 
     @classmethod
-    def of(cls, mixture: Mixture, log_weight: Array | None = None) -> Factored:
-        """Factor a mixture; `log_weight` (..., C) replaces its weights where they would underflow."""
-        white = whitener(mixture.cov)
-        return cls(log_of(mixture.weight) if log_weight is None else log_weight, mixture.mean, white)
+    def of(cls, mixture: Mixture) -> Factored:
+        """Factor a mixture."""
+        return cls(log_of(mixture.weight), mixture.mean, whitener(mixture.cov))
 
     @property
     def lead(self) -> tuple[int, ...]:
@@ -232,14 +243,13 @@ def padded(mixture: Mixture, count: int) -> Mixture:
     return Mixture(weight, mixture.mean[..., at, :], mixture.cov[..., at, :, :])
 
 
-def stacked(one: Mixture, other: Mixture) -> Mixture:
-    """Stack two mixtures (..., C1) and (..., C2) as sources (..., 2, C), the smaller padded."""
-    count = max(one.count, other.count)
-    pair = padded(one, count), padded(other, count)
+def stacked(*mixtures: Mixture) -> Mixture:
+    """Stack K mixtures (..., C_k) as sources (..., K, C), the smaller padded."""
+    each = [padded(mixture, max(m.count for m in mixtures)) for mixture in mixtures]
     return Mixture(
-        np.stack([m.weight for m in pair], -2),
-        np.stack([m.mean for m in pair], -3),
-        np.stack([m.cov for m in pair], -4),
+        np.stack([m.weight for m in each], -2),
+        np.stack([m.mean for m in each], -3),
+        np.stack([m.cov for m in each], -4),
     )
 
 

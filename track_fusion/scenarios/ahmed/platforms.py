@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
 
 from track_fusion.densities.log_domain import log_of, normalised
-from track_fusion.densities.mixture.mixture import Mixture, moments
+from track_fusion.densities.mixture.mixture import Mixture, moments, stacked
 from track_fusion.densities.mixture.reduction import prune, runnalls
 from track_fusion.filters.gaussian_sum_modes import GaussianSumModes, MixtureModes
 from track_fusion.filters.interacting_multiple_model import InteractingMultipleModel, Modes
@@ -17,10 +16,10 @@ from track_fusion.filters.iterated_corrector import IteratedCorrector
 from track_fusion.linalg import Array
 from track_fusion.models.measurement import RangeRangeRateSensor
 from track_fusion.models.turn import KnownTurn, KnownTurnParams
-from track_fusion.peers.peer import Fuse, Peer, Schedule, communicate, gaussian, ring, sources
+from track_fusion.peers import Fuse, Peer, Schedule, communicate, ring
 from track_fusion.random_streams import stream
-from track_fusion.rules import RULES
-from track_fusion.study.scenario import RuleChoice, check_needs
+from track_fusion.rules import SourceTracks
+from track_fusion.study.rule_choice import RuleChoice, check_needs
 from track_fusion.trackers.fusion_loop import filtered
 from track_fusion.tracks import StateLayout
 
@@ -114,15 +113,12 @@ def fuse_modes(choice: RuleChoice, seed: int) -> Fuse[MixtureModes]:
     ParameterError    the rule needs something beside two tracks
     """
     check_needs([choice])
-    rule = RULES[choice.key]
 
     def fuse(own: MixtureModes, heard: MixtureModes, common: MixtureModes | None, count: int) -> MixtureModes:
-        extras = {"seed": np.random.default_rng([seed, count])} if "seed" in rule.optional else {}
-        tracks = dataclasses.replace(sources(own.mixture, heard.mixture), extras=extras)
-        fused = rule.fuse(tracks, choice.params)
+        extras = {"seed": np.random.default_rng([seed, count])} if "seed" in choice.rule.optional else {}
+        fused = choice.fuse(SourceTracks.of(stacked(own.mixture, heard.mixture), **extras))
         log_eta = fused.info.get("log_eta", np.zeros(own.probability.shape))
-        mixture = gaussian(fused.mean, fused.cov) if fused.mixture is None else fused.mixture
-        return MixtureModes(normalised(log_of(own.probability) + log_eta), mixture)
+        return MixtureModes(normalised(log_of(own.probability) + log_eta), fused.density)
 
     return fuse
 

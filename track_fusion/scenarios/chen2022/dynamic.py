@@ -26,18 +26,14 @@ from track_fusion.rules.geodesic_projection import GeodesicProjectionParams
 from track_fusion.rules.mhdp_explicit import MhdpExplicitParams
 from track_fusion.rules.mhdp_iterative import MhdpIterativeParams
 from track_fusion.rules.quasi_minimal_manhattan import QuasiMinimalManhattanParams
+from track_fusion.scenarios.chen2022 import PAPER
 from track_fusion.study.chart import Chart, Series
+from track_fusion.study.claims import Claim
 from track_fusion.study.one_target import drawn, fused_row, same_filters
-from track_fusion.study.scenario import (
-    Claim,
-    Progress,
-    RuleChoice,
-    Samples,
-    Scenario,
-    Tracking,
-    check_needs,
-    chosen,
-)
+from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rule_choice import RuleChoice, check_needs
+from track_fusion.study.scenario import Scenario
+from track_fusion.study.scene import Tracking
 from track_fusion.tracks import StateLayout
 
 #: Degrees of freedom of all densities, and covariance over scatter.
@@ -146,7 +142,7 @@ def rows(choices: Sequence[RuleChoice]) -> dict[str, Row]:
 
 def squared_errors(
     base: Tracking, table: Mapping[str, Row], runs: Sequence[int], seed: int, progress: Progress
-) -> Samples:
+) -> Outcomes:
     """Squared position errors of every row, (R, T), over the same Monte Carlo runs."""
     truth = base.truths(seed, runs)[:, :, LAYOUT.position]
     squares = {row: np.empty((len(runs), base.steps)) for row in table}
@@ -159,7 +155,7 @@ def squared_errors(
 
 def compared(
     base: Tracking, choices: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress
-) -> Samples:
+) -> Outcomes:
     """Root of the time-averaged squared position error of each run, (R,), under any rules, with both filters.
 
     Raises
@@ -171,13 +167,13 @@ def compared(
     return {f"{row}/position_rmse_m": np.sqrt(squares.mean(1)) for row, squares in errors.items()}
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """ARMSE of each row, and by how much it exceeds that of MHDP-E with the same filter, the runs being paired."""
-    estimates = {f"{row}/{FIGURE}": armse(squares) for row, squares in samples.items()}
-    for row, squares in samples.items():
+    estimates = {f"{row}/{FIGURE}": armse(squares) for row, squares in outcomes.items()}
+    for row, squares in outcomes.items():
         reference = f"{row.partition('-')[0]}-{MHDP_E}"
-        if row != reference and reference in samples:
-            pair = np.stack([squares, samples[reference]], -1)
+        if row != reference and reference in outcomes:
+            pair = np.stack([squares, outcomes[reference]], -1)
             estimates[f"{row}/{EXCESS}"] = Estimate.of_averages(pair, _excess)
     return estimates
 
@@ -188,11 +184,11 @@ def _excess(mean: Array) -> Array:
     return np.asarray(both[:, 0] - both[:, 1])
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Position RMSE over the steps, one chart a filter; DCI, far above, is left out as in Fig. 3."""
     panels = []
     for name in FILTERS:
-        lines = {row: squares for row, squares in samples.items() if row.startswith(f"{name}-")}
+        lines = {row: squares for row, squares in outcomes.items() if row.startswith(f"{name}-")}
         series = [
             Series(row.partition("-")[2], np.arange(1, squares.shape[1] + 1), rmse(squares))
             for row, squares in lines.items()
@@ -242,7 +238,7 @@ def scenario(key: str, title: str, base: Tracking, table: Mapping[str, Sequence[
     return Scenario(
         key=key,
         title=title,
-        paper="Chen and Zhou, Multisensor Estimation Fusion on Statistical Manifold, 5.2",
+        paper=f"{PAPER}, 5.2",
         shows="rules that see heavy-tailed densities beside rules that see moments, when outliers disturb motion and "
         "measurements and the fused posterior is fed back to robust filters",
         published={
@@ -252,7 +248,7 @@ def scenario(key: str, title: str, base: Tracking, table: Mapping[str, Sequence[
         default_runs=runs,
         publication_runs=500,
         assumptions=ASSUMPTIONS,
-        sample=lambda runs, seed, progress, only: squared_errors(
+        simulate=lambda runs, seed, progress, only: squared_errors(
             base, chosen(rows(RULE_CHOICES), only), runs, seed, progress
         ),
         figures=figures,

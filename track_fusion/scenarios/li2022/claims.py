@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.study.scenario import Claim
+from track_fusion.study.claims import Claim
 
 #: The rows of a table by their rules, and covariance union's as it is about the mean at which its bound is least.
 RULES = ("alone", "ic", "naive", "arithmetic_average", "covariance_intersection", "covariance_union")

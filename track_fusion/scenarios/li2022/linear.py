@@ -8,6 +8,7 @@ from track_fusion.filters.kalman import Kalman
 from track_fusion.filters.particle import SirParams
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
+from track_fusion.scenarios.li2022 import PAPER
 from track_fusion.scenarios.li2022.claims import (
     ASSUMPTIONS,
     AVERAGE,
@@ -25,9 +26,12 @@ from track_fusion.scenarios.li2022.claims import (
 from track_fusion.scenarios.li2022.claims import (
     RULES as ROWS,
 )
+from track_fusion.study.claims import Claim, Printed
 from track_fusion.study.one_target import RULE_CHOICES, Row, alone_row, fused_row, same_filters, sir_rows
 from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
-from track_fusion.study.scenario import Claim, Printed, RuleChoice, Scenario, Tracking
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Scenario
+from track_fusion.study.scene import Tracking
 from track_fusion.tracks import planar_layout
 
 #: Table I: ARMSE of position (m) and velocity (m/s).
@@ -136,14 +140,14 @@ def _claims() -> tuple[Claim, ...]:
 SCENARIO = Scenario(
     key="li2022-linear",
     title="Two position sensors, one target, linear and Gaussian",
-    paper="Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average Density Fusion, IV-A",
+    paper=f"{PAPER}, IV-A",
     shows="what fusing with unknown correlation costs and gains when the fused posterior is fed back to both filters",
     published=published(TABLE_1, QUANTITIES) | SECTION_4A,
     published_runs=100,
     default_runs=150,
     publication_runs=1000,
     assumptions=ASSUMPTIONS,
-    sample=STUDY.sample,
+    simulate=STUDY.simulate,
     figures=STUDY.figures,
     charts=STUDY.charts,
     claims=_claims(),

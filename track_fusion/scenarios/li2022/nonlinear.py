@@ -8,6 +8,7 @@ from track_fusion.filters.cubature import Cubature
 from track_fusion.filters.particle import SirParams
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
+from track_fusion.scenarios.li2022 import PAPER
 from track_fusion.scenarios.li2022.claims import (
     ASSUMPTIONS,
     AVERAGE,
@@ -21,9 +22,12 @@ from track_fusion.scenarios.li2022.claims import (
     union_claims,
     weight_claims,
 )
+from track_fusion.study.claims import Claim, Printed
 from track_fusion.study.one_target import RULE_CHOICES, Row, alone_row, fused_row, same_filters, sir_rows
 from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
-from track_fusion.study.scenario import Claim, Printed, RuleChoice, Scenario, Tracking
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Scenario
+from track_fusion.study.scene import Tracking
 from track_fusion.tracks import StateLayout
 
 #: Table II: ARMSE of position (m), velocity (m/s) and turn rate (deg/s). Of CKF-NF the text has "2 15.76".
@@ -157,7 +161,7 @@ def _claims() -> tuple[Claim, ...]:
 SCENARIO = Scenario(
     key="li2022-nonlinear",
     title="Two range-bearing sensors, one turning target",
-    paper="Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average Density Fusion, IV-B",
+    paper=f"{PAPER}, IV-B",
     shows="cubature and particle filters under fusion with feedback; how naive fusion loses the target",
     published=published(TABLE_2, QUANTITIES) | SECTION_4B,
     published_runs=100,
@@ -168,7 +172,7 @@ SCENARIO = Scenario(
         "the transition uses the turn rate before the step; the process noise is block-diagonal; sigma_theta is "
         "positive; bearings by atan2, residuals wrapped",
     ),
-    sample=STUDY.sample,
+    simulate=STUDY.simulate,
     figures=STUDY.figures,
     charts=STUDY.charts,
     claims=_claims(),

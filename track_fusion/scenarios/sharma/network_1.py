@@ -13,12 +13,15 @@ from track_fusion.filters.kalman import Kalman
 from track_fusion.linalg import Array, matvec
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.models.measurement import LinearSensor
-from track_fusion.peers.peer import Round
+from track_fusion.peers import Round
 from track_fusion.random_streams import stream
+from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import network as shared
 from track_fusion.scenarios.sharma.network import RULE_CHOICES, Local, Network, common_claims
 from track_fusion.study.chart import Chart
-from track_fusion.study.scenario import Claim, Progress, Samples, Scenario
+from track_fusion.study.claims import Claim
+from track_fusion.study.rows import Outcomes, Progress
+from track_fusion.study.scenario import Scenario
 
 NODES = 10
 #: The prior of the state, and of every node.
@@ -62,14 +65,14 @@ READINGS = {
 }
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Run the rows whose names start with `only`: errors and covariances at S10."""
-    return shared.sample(READINGS, runs, seed, progress, only)
+    return shared.simulate(READINGS, runs, seed, progress, only)
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Fig. 6 for both readings of the measurements."""
-    return shared.charts({"": "S10, (82) as printed", "one_row": "S10, one component each"}, samples)
+    return shared.charts({"": "S10, (82) as printed", "one_row": "S10, one component each"}, outcomes)
 
 
 def _bloated(text: str, reading: str) -> Claim:
@@ -84,9 +87,8 @@ def _bloated(text: str, reading: str) -> Claim:
 SCENARIO = Scenario(
     key="sharma-network-1",
     title="Ten nodes in a network, one measurement each",
-    paper="Sharma et al., Harmonic Mean Density Fusion in Distributed Tracking, 6.2, Figs. 4 and 6",
+    paper=f"{PAPER}, 6.2, Figs. 4 and 6",
     shows="what each rule reports and how large its errors are where the same news comes by several ways",
-    published={},
     published_runs=50_000,
     default_runs=20_000,
     publication_runs=50_000,
@@ -100,7 +102,7 @@ SCENARIO = Scenario(
         "each node measures the first row of (82) alone",
         "heavily bloated: the trace reported is at least 1.5 times that of the errors",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=shared.figures,
     charts=charts,
     claims=(

@@ -15,10 +15,13 @@ from track_fusion.metrics.accuracy import Estimate
 from track_fusion.models.base import Transition
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.random_streams import stream
+from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import network as shared
 from track_fusion.scenarios.sharma.network import RULE_CHOICES, Local, Network, common_claims
 from track_fusion.study.chart import Chart
-from track_fusion.study.scenario import Claim, Progress, Samples, Scenario
+from track_fusion.study.claims import Claim
+from track_fusion.study.rows import Outcomes, Progress
+from track_fusion.study.scenario import Scenario
 from track_fusion.trackers.fusion_loop import filtered
 
 STEPS, NODES = 5, 5
@@ -54,14 +57,14 @@ def estimate(runs: Sequence[int], seed: int) -> Local:
 READINGS = {"": Network(estimate, ([(f"S{i}", "S5") for i in range(1, NODES)],), "S5")}
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Run the rows whose names start with `only`: errors and covariances at S5."""
-    return shared.sample(READINGS, runs, seed, progress, only)
+    return shared.simulate(READINGS, runs, seed, progress, only)
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Fig. 7."""
-    return shared.charts({"": "S5"}, samples)
+    return shared.charts({"": "S5"}, outcomes)
 
 
 def _almost(central: Estimate, harmonic: Estimate) -> bool:
@@ -71,9 +74,8 @@ def _almost(central: Estimate, harmonic: Estimate) -> bool:
 SCENARIO = Scenario(
     key="sharma-network-2",
     title="Five nodes track for five steps, then fuse at one",
-    paper="Sharma et al., Harmonic Mean Density Fusion in Distributed Tracking, 6.3, Figs. 5 and 7",
+    paper=f"{PAPER}, 6.3, Figs. 5 and 7",
     shows="what each rule reports and how large its errors are where tracks share process noise and a prior",
-    published={},
     published_runs=50_000,
     default_runs=20_000,
     publication_runs=50_000,
@@ -87,7 +89,7 @@ SCENARIO = Scenario(
         "errors average; at a weight of 0 or 1 the news of S1 would be lost",
         "almost equal: the trace is at most 1.25 times the other",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=shared.figures,
     charts=charts,
     claims=(
