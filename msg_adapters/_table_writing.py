@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2, PointField
 
-from msg_adapters._table import CODES, WORD, cov_name, upper_pairs
+from msg_adapters._table import CODES, PLANS, WORD, cov_name, upper_pairs
 from msg_adapters.arrays import Floats
 from msg_adapters.header import make_header
 
@@ -30,7 +30,8 @@ class Layout:
     upper: NDArray[np.intp]  # the upper triangle in a flattened (n, n)
 
 
-def make_layout(columns: Sequence[tuple[str, str, int]], axes: Sequence[str], with_cov: bool) -> Layout:
+@lru_cache(maxsize=2 * PLANS)
+def make_layout(columns: tuple[tuple[str, str, int], ...], axes: tuple[str, ...], with_cov: bool) -> Layout:
     """Lay out a row: (name, code, count) columns, the axes as `mean`, the upper triangle as `cov`.
 
     Raises
@@ -43,7 +44,7 @@ def make_layout(columns: Sequence[tuple[str, str, int]], axes: Sequence[str], wi
     if repeated or not axes or "" in axes:
         raise ValueError(
             "The axes must be distinct names, and so must the fields made from them. "
-            f"Got {tuple(axes)!r}{', which give twice ' + ', '.join(repeated) if repeated else ''}."
+            f"Got {axes!r}{', which give twice ' + ', '.join(repeated) if repeated else ''}."
         )
     # Aligned, since a C++ reader may look at the values where they stand.
     blocks = [("mean", "<f8", (len(axes),)), ("cov", "<f8", (len(pairs),))]

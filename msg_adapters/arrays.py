@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-#: What stands for a position-velocity block that a message cannot carry.
+#: What stands for a position-velocity block that a message cannot carry: none, or a bound of every possible one.
 CrossBlock = Literal["block_diagonal", "conservative"]
 
 
@@ -31,62 +31,50 @@ class TrackLike(Protocol):
     @property
     def frame_id(self) -> str:
         """Frame of every state."""
-        ...
 
     @property
     def weight(self) -> Floats:
         """Mixture weights (N, C)."""
-        ...
 
     @property
     def mean(self) -> Floats:
         """Means (N, C, n)."""
-        ...
 
     @property
     def cov(self) -> Floats:
         """Covariances (N, C, n, n)."""
-        ...
 
     @property
     def time_ns(self) -> NDArray[np.int64]:
         """Times of validity (N,), ns."""
-        ...
 
     @property
     def track_id(self) -> NDArray[np.int64]:
         """Identities (N,)."""
-        ...
 
     @property
     def source(self) -> NDArray[np.uint32]:
         """Provenance bits (N,)."""
-        ...
 
     @property
     def status(self) -> NDArray[np.uint8]:
         """Status bits (N,)."""
-        ...
 
     @property
     def existence(self) -> Floats:
         """Existence probabilities (N,)."""
-        ...
 
     @property
     def dof(self) -> Floats:
         """Degrees of freedom (N,), inf = Gaussian."""
-        ...
 
     @property
     def uuid(self) -> NDArray[np.uint8] | None:
         """Global identities (N, 16), or None."""
-        ...
 
     @property
     def phd(self) -> bool:
         """Whether weights need not sum to 1."""
-        ...
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -134,7 +134,7 @@ def _layout(axes: tuple[str, ...], uuid: bool, dof: bool, phd: bool) -> Layout:
     columns = [c for c in columns if written.get(c[0], True)]
     if reserved := sorted(_RESERVED.intersection(axes)):
         raise ValueError(f"The axes must not have the names of other fields. Got {', '.join(reserved)}.")
-    layout = make_layout(columns, axes, with_cov=True)
+    layout = make_layout(tuple(columns), axes, with_cov=True)
     read = _axes(f.name for f in layout.fields)
     if read != axes:
         raise ValueError(f"The axes must be told from their covariance names. Got {axes!r}, read as {read!r}.")

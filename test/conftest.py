@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 # Domains up to 101 keep Fast DDS's ports below the range from which Linux hands out ephemeral ones; 0 is the users'.
 DOMAINS = range(1, 102)
 # What is tested in these folders no version of NumPy or SciPy changes: texts, processes, packaging.
-ONCE = frozenset({"cli", "nodes", "package", "tools"})
+ONCE = frozenset({"bags", "cli", "nodes", "package", "plugins", "tools"})
 
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"

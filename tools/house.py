@@ -17,14 +17,14 @@ ROOT = Path(__file__).resolve().parent.parent
 #: Rooms by floor, from the top down: a module imports from its own room and from the floors below.
 FLOORS: tuple[Mapping[str, str], ...] = (
     {"cli": "the command track-fusion, one command a file"},
-    {"demo": "bring-up of processes, the demonstration, recording"},
+    {"demo": "the wiring and the processes of a scenario's nodes, the demonstration"},
     {"nodes": "the ROS nodes: thin"},
     {
         "bags": "bags without ROS",
         "scenarios": "one published study a folder",
         "report": "pages and pictures",
     },
-    {"study": "what a scenario is: runs, samples, figures, claims and verdicts"},
+    {"study": "what a scenario is: runs, outcomes, figures, claims and verdicts"},
     {"centre": "the fusion centre: a value and pure steps"},
     {"peers": "decentralised fusion"},
     {"trackers": "detections in, tracks out"},

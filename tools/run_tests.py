@@ -10,6 +10,8 @@ out/test/.
 from __future__ import annotations
 
 import argparse
+import atexit
+import contextlib
 import dataclasses
 import os
 import shutil
@@ -17,6 +19,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -30,13 +33,15 @@ PYTHON = ROOT / ".venv" / "bin" / "python"
 EXECUTABLES = ("sensor_tracker", "fusion_centre", "replay", "evaluator", "track-fusion")
 # Not .venv/bin/colcon: with a sourced ROS, colcon may be the system's, whose tests would not see the environment.
 COLCON = "import sys; from colcon_core.command import main; sys.exit(main())"
-EXTRAS = ("click", "rich", "rosbags", "matplotlib")
+EXTRAS = ("click", "jsonschema", "rich", "rosbags", "matplotlib")
 FLOOR = ("numpy==1.26.*", "scipy==1.11.*")
 FLOOR_PYTHONS = ((3, 11), (3, 12))  # NumPy 1.26 has no wheel for later ones
 # Two tests at a time on two cores; a file's tests stay together, for they share processes.
 PARALLEL = ("-n", "auto", "--dist", "loadfile")
 # Threads of BLAS only fight for the cores: with SciPy 1.11's, tests of small matrices take five times as long.
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
+# Hundreds of processes start: compiled modules are kept, whatever the shell says.
+DROPPED = ("PYTHONDONTWRITEBYTECODE",)
 COMMAND_LIMIT_S = 1200  # far above what any one command takes; a hang must not outlive it
 
 
@@ -65,6 +70,10 @@ class Counts:
         return f"{self.passed} passed, {self.failed} failed, {self.skipped} skipped"
 
 
+#: Commands at work, to be ended with this one.
+running: set[subprocess.Popen[str]] = set()
+
+
 def run(
     command: Sequence[object], *, cwd: Path = ROOT, env: dict[str, str] | None = None, capture: bool = False
 ) -> str:
@@ -72,16 +81,19 @@ def run(
     words = [str(word) for word in command]
     shown = " ".join(words).replace(f"{PYTHON} -c {COLCON}", "colcon").replace(f"{ROOT}/", "")
     print("$", shown, flush=True)
-    clean = {k: v for k, v in (env or dict(os.environ)).items() if k not in WHEEL_VARIABLES or sourced_prefixes()}
+    dropped = DROPPED if sourced_prefixes() else (*DROPPED, *WHEEL_VARIABLES)
+    clean = {k: v for k, v in (env or os.environ).items() if k not in dropped}
     process = subprocess.Popen(
         words, cwd=cwd, env=clean, text=True, stdout=subprocess.PIPE if capture else None, start_new_session=True
     )
+    running.add(process)
     try:
         output, _ = process.communicate(timeout=COMMAND_LIMIT_S)
     except subprocess.TimeoutExpired:
         raise StageFailure(f"took longer than {COMMAND_LIMIT_S} s: {shown}") from None
     finally:
         stop_group(process)
+        running.discard(process)
     if process.returncode != 0:
         print(output or "", end="")
         raise StageFailure(f"exit code {process.returncode} from: {shown}")
@@ -95,6 +107,12 @@ def stop_group(process: subprocess.Popen[str]) -> None:
     except ProcessLookupError:
         return
     process.wait()
+
+
+def end_commands() -> None:
+    """End all commands at work and what they left running."""
+    for process in list(running):
+        stop_group(process)
 
 
 def junit_counts(path: Path) -> Counts:
@@ -241,7 +259,18 @@ def floor_python() -> Path:
     """Make or update the environment of the oldest versions; return its interpreter."""
     if sys.version_info[:2] not in FLOOR_PYTHONS:
         raise StageSkipped("NumPy 1.26 has no wheel for Python {}.{}".format(*sys.version_info[:2]))
-    return make_venv(".venv-floor", "all,test", *FLOOR)
+    with making:
+        return make_venv(".venv-floor", "all,test", *FLOOR)
+
+
+#: One at a time makes the environment of the oldest versions; for the next it is there.
+making = threading.Lock()
+
+
+def make_ahead() -> None:
+    """Make the environment of the oldest versions; when that fails, the stage that needs it tries again and tells."""
+    with contextlib.suppress(StageFailure, StageSkipped):
+        floor_python()
 
 
 def bare(counts: list[Counts]) -> None:
@@ -295,10 +324,13 @@ def main() -> int:
     """Run stages; print the summary; return the exit code."""
     names, rest = chosen()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what runs is ended, as on Ctrl-C
+    atexit.register(end_commands)
     RESULTS.mkdir(parents=True, exist_ok=True)
     # The last line of `make test-all` counts what its first half, `make test`, has run just before.
     before = [RESULTS / f"{name}.xml" for name in TEST if rest]
     counts = [junit_counts(path) for path in before if path.exists()]
+    if "floor" in names[1:]:  # meanwhile earlier stages run: it waits for the network more than it computes
+        threading.Thread(target=make_ahead, daemon=True).start()
     results = {name: run_stage(name, counts) for name in names}
     print("\n=== Summary")
     for name, (outcome, took_s) in results.items():

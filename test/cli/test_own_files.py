@@ -221,7 +221,7 @@ def test_an_interrupted_study_goes_on(examples: Path, tmp_path: Path) -> None:
     kept[0].unlink()
     with np.load(kept[1]) as arrays:
         changed = {name: arrays[name] for name in arrays.files}
-    changed["sample/given-naive"] = np.full_like(changed["sample/given-naive"], 100.0)
+    changed["outcome/given-naive"] = np.full_like(changed["outcome/given-naive"], 100.0)
     before = kept[2].stat().st_mtime_ns
     assert run(*words, "--runs", "2000").stdout == whole
     np.savez(kept[1], **changed)

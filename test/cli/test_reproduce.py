@@ -27,27 +27,30 @@ from pathlib import Path
 import numpy as np
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.scenario import Claim, Scenario
+from track_fusion.study.claims import Claim
+from track_fusion.study.scenario import Scenario
 
-def sample(runs, seed, progress, only=""):
+def simulate(runs, seed, progress, only=""):
     Path(__file__).with_suffix(f".asked-{seed}-{runs.start}-{runs.stop}").touch()
     return {"heads": np.arange(runs.start, runs.stop) + seed}
 
-def figures(samples):
-    runs = len(samples["heads"])
+def figures(outcomes):
+    runs = len(outcomes["heads"])
     return {
         "kf-alone/error_m": Estimate(1.0, 0.01, runs),
         "kf-ic/error_m": Estimate(9.0, 0.01, runs),
         "kf-naive/error_m": Estimate(2.0, float("nan"), runs),
-        "kf-sum/heads_1": Estimate.exact(samples["heads"].sum()),
+        "kf-sum/heads_1": Estimate.exact(outcomes["heads"].sum()),
     }
 
-def charts(samples):
+def charts(outcomes):
     return [Chart("Heads & <tails>", "run", "1", (Series("heads", np.arange(3.0), np.array([1.0, np.nan, 2.0])),))]
 
 SCENARIO = Scenario(
-    "NAME", "A fair <coin>", "Nobody", "nothing", {"kf-alone/error_m": 1.01, "kf-ic/error_m": 0.5}, 10, RUNS, 900,
-    ("it is fair",), sample, figures, charts, (
+    key="NAME", title="A fair <coin>", paper="Nobody", shows="nothing",
+    simulate=simulate, figures=figures, charts=charts,
+    published={"kf-alone/error_m": 1.01, "kf-ic/error_m": 0.5}, published_runs=10, default_runs=RUNS,
+    publication_runs=900, assumptions=("it is fair",), claims=(
         Claim("heads & tails are rare", "Fig. 1", ("kf-sum/heads_1",), lambda e: e.value < 0),
         Claim.order("naive lies between", "Fig. 2", "kf-alone/error_m", "kf-naive/error_m", "kf-ic/error_m"),
         Claim.order("nobody measured it", "Fig. 3", "kf-alone/error_m", "kf-nobody/error_m"),

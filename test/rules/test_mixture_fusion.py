@@ -14,11 +14,12 @@ from track_fusion.densities.log_domain import normalised
 from track_fusion.densities.mixture.algebra import LogMixture, first_order, power, product
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments, sample
 from track_fusion.densities.mixture.sampling import Weighted, single_shot_em
+from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.linalg import Array
 from track_fusion.params import from_dict
 from track_fusion.rules import FusedTracks, SourceTracks, get_rule
 from track_fusion.rules.shared import sampling
-from track_fusion.scenarios.ahmed.mixtures import Problem, divergence, log_fused
+from track_fusion.scenarios.ahmed.mixtures import Problem, log_fused
 from track_fusion.scenarios.ahmed.random import study_problem
 
 
@@ -40,7 +41,7 @@ def _median(problems: list[Problem], **values: Any) -> float:
     far = []
     for p in problems:
         fused = run("mixture_exact", p.tracks(np.random.default_rng(1)), max_components=0, **values)
-        far.append(divergence(p.log_exact(), log_fused(fused)))
+        far.append(kl_on_grid(p.log_exact(), log_fused(fused)))
     return float(np.median(far))
 
 

@@ -46,6 +46,7 @@ def read_bag(path: Path, topics: Collection[str]) -> dict[str, list[Any]]:
 
         store = get_typestore(Stores.ROS2_JAZZY)
         messages: dict[str, list[Any]] = {topic: [] for topic in topics}
-        for connection, _, data in reader.messages([c for c in reader.connections if c.topic in messages]):
+        wanted = [connection for connection in reader.connections if connection.topic in messages]
+        for connection, _, data in reader.messages(wanted) if wanted else ():  # to the package, none means all
             messages[connection.topic].append(store.deserialize_cdr(data, connection.msgtype))
         return messages

@@ -15,8 +15,8 @@ from track_fusion.params import ParameterError
 
 if TYPE_CHECKING:
     from track_fusion.metrics.significance import Difference
-    from track_fusion.scenarios import Samples, Scenario
-    from track_fusion.study.runs import RuleSpec
+    from track_fusion.scenarios import Outcomes, Scenario
+    from track_fusion.study.study import RuleSpec
 
 
 @click.command(short_help="Compare fusion rules on a published scenario.")
@@ -42,10 +42,10 @@ def compare(name: str, rules: str, params: str, runs: int | None, seed: int, job
       track-fusion compare li2022-linear --rules covariance_intersection,arithmetic_average,naive
       track-fusion compare li2022-linear --rules ./my_rule.py,covariance_intersection@uniform --runs 1000
     """  # noqa: D301  click reads \b as "do not wrap"
-    from track_fusion.cli.progress import studies
+    from track_fusion.cli.progress import results
     from track_fusion.metrics.significance import paired_differences
     from track_fusion.scenarios import find_scenario
-    from track_fusion.study.runs import Work, choice
+    from track_fusion.study.study import Study, choice
 
     scenario = find_scenario(name)
     if scenario.compare is None:
@@ -55,8 +55,8 @@ def compare(name: str, rules: str, params: str, runs: int | None, seed: int, job
     if len({c.name for c in chosen}) < len(chosen):
         raise ParameterError(f"The '--rules' must differ. Got {rules}.")
     count = (runs or scenario.default_runs) if scenario.random else 1
-    (study,) = studies([Work(name, find_scenario, count, seed, rules=specs)], jobs or os.cpu_count() or 1, None)
-    groups = by_filter_and_quantity(study.samples)
+    (result,) = results([Study(name, find_scenario, count, seed, rules=specs)], jobs or os.cpu_count() or 1, None)
+    groups = by_filter_and_quantity(result.outcomes)
     differences = {group: paired_differences(scores) for group, scores in groups.items()}
     if as_json:
         output.print_json(_as_json(scenario, count, seed, groups, differences))
@@ -72,7 +72,7 @@ def rule_specs(rules: str, params: str) -> tuple[RuleSpec, ...]:
     ParameterError    not JSON of the right form, or parameters of a rule that is not named
     """
     from track_fusion.plugins import is_path
-    from track_fusion.study.runs import RuleSpec
+    from track_fusion.study.study import RuleSpec
 
     try:
         given = json.loads(params)
@@ -92,10 +92,10 @@ def rule_specs(rules: str, params: str) -> tuple[RuleSpec, ...]:
     return tuple(map(spec, names))
 
 
-def by_filter_and_quantity(samples: Samples) -> dict[tuple[str, str], Samples]:
+def by_filter_and_quantity(outcomes: Outcomes) -> dict[tuple[str, str], Outcomes]:
     """Group scores named <filter>-<rule>/<quantity>: {(filter, quantity): {rule: (R,)}}."""
-    groups: dict[tuple[str, str], Samples] = {}
-    for name, values in samples.items():
+    groups: dict[tuple[str, str], Outcomes] = {}
+    for name, values in outcomes.items():
         row, _, quantity = name.rpartition("/")
         one, _, rule = row.partition("-")
         groups.setdefault((one, quantity), {})[rule] = values
@@ -103,7 +103,7 @@ def by_filter_and_quantity(samples: Samples) -> dict[tuple[str, str], Samples]:
 
 
 def _as_json(
-    scenario: Scenario, runs: int, seed: int, groups: Mapping[tuple[str, str], Samples],
+    scenario: Scenario, runs: int, seed: int, groups: Mapping[tuple[str, str], Outcomes],
     differences: Mapping[tuple[str, str], list[Difference]],
 ) -> dict[str, Any]:  # fmt: skip
     from track_fusion.metrics.accuracy import Estimate
@@ -124,7 +124,7 @@ def _as_json(
 
 
 def _print(
-    scenario: Scenario, runs: int, seed: int, groups: Mapping[tuple[str, str], Samples],
+    scenario: Scenario, runs: int, seed: int, groups: Mapping[tuple[str, str], Outcomes],
     differences: Mapping[tuple[str, str], list[Difference]],
 ) -> None:  # fmt: skip
     from track_fusion.metrics.accuracy import Estimate

@@ -95,6 +95,8 @@ def _tables(result: dict[str, Any], filter_row: str, rules: tuple[str, ...], run
 
 def _row(figures: Mapping[str, Any], filter_row: str, row: str, quantity: str, runs: int) -> tuple[str, ...]:
     """Write the figures of a row; nothing where it has none over ROS."""
+    from track_fusion.report.page import measured_text, published_text
+
     name = f"{filter_row}-{row}"
     many_name = f"{name},{runs}-runs" if "@" in name else f"{name}@{runs}-runs"
     ros, library = (figures.get(f"{path}/{name}/{quantity}") for path in ("ros", "library"))
@@ -104,6 +106,5 @@ def _row(figures: Mapping[str, Any], filter_row: str, row: str, quantity: str, r
     label, same = "sensor 1 alone" if row == "alone" else row, "" if library is None else f"{library['value']:.4f}"
     if many is None:
         return label, f"{ros['value']:.4f}", same, "", "", ""
-    error = "" if many["standard_error"] is None else f" ± {many['standard_error']:.2f}"
-    published = "" if many["published"] is None else f"{many['published']:.2f}"
-    return label, f"{ros['value']:.4f}", same, f"{many['value']:.2f}{error}", published, many["verdict"]
+    measured = measured_text(many["value"], many["standard_error"])
+    return label, f"{ros['value']:.4f}", same, measured, published_text(many["published"]), many["verdict"]

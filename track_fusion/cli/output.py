@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from track_fusion.params import Spec, specs
+from track_fusion.params import specs
 
 #: Width of a table that goes to a file or a pipe.
 FILE_WIDTH = 120
@@ -69,7 +69,7 @@ def parameters(params: Any) -> list[dict[str, Any]]:
     return [
         {
             "name": name,
-            "type": type_name(spec),
+            "type": "list of " * spec.sequence + spec.kind.__name__,
             "default": default,
             "low": spec.low,
             "low_excluded": spec.strict,
@@ -81,11 +81,6 @@ def parameters(params: Any) -> list[dict[str, Any]]:
         }
         for name, (spec, default) in specs(params).items()
     ]
-
-
-def type_name(spec: Spec) -> str:
-    """Return "float", "int", "bool", "str", or "list of" one of them."""
-    return f"list of {spec.kind.__name__}" if spec.sequence else spec.kind.__name__
 
 
 def shown_default(default: Any) -> str:

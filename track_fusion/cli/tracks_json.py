@@ -23,13 +23,9 @@ def read_tracks(text: bytes, needs: Collection[str], rule: str, optional: Collec
 
     Parameters
     ----------
-    text : JSON    {"tracks": [track, ...]} and what the rule uses of common, cross_cov, target, seed; a track is
-                   {"mean": n numbers, "cov": n x n} or {"components": [{"weight", "mean", "cov"}, ...]}, with "dof"
-                   ("cov" is the covariance all the same; absent or null: Gaussian) and what the rule uses of
-                   independent_cov, likelihood
-    needs          names of the extras that the rule needs: the others are refused, but for the
-    optional       ones
-    rule           its key, for messages
+    text               JSON of the form that the help of `track-fusion fuse` gives
+    needs, optional    names of the extras that the rule needs, and of those that it can use; others are refused
+    rule               its key, for messages
 
     Returns
     -------

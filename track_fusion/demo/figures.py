@@ -29,11 +29,11 @@ def library(demo: Demo, rows: list[str], progress: Callable[[float], None]) -> t
             progress((done + share) / len(wanted))
 
         try:
-            samples = demo.scenario.sample(range(demo.library_runs), demo.seed, part, only)
+            outcomes = demo.scenario.simulate(range(demo.library_runs), demo.seed, part, only)
         except ParameterError:
             continue
         for measured, runs in ((same, 1), (many, demo.library_runs)):
-            measured |= demo.scenario.figures({name: array[:runs] for name, array in samples.items()})
+            measured |= demo.scenario.figures({name: array[:runs] for name, array in outcomes.items()})
     progress(1.0)
     return same, many
 
@@ -59,11 +59,5 @@ def figures(demo: Demo, over_ros: dict[str, dict[str, float]], same: Figures, ma
         row, _, quantity = name.rpartition("/")
         variant = f"{row},{demo.library_runs}-runs" if "@" in row else f"{row}@{demo.library_runs}-runs"
         listed.append({**figure, "name": f"library/{variant}/{quantity}"})
-    return {
-        "scenario": scenario.key,
-        "parameter_file": demo.name,
-        "runs": 1,
-        "seed": demo.seed,
-        "library_runs": demo.library_runs,
-        "figures": listed,
-    }
+    run = {"scenario": scenario.key, "parameter_file": demo.name, "runs": 1, "seed": demo.seed}
+    return {**run, "library_runs": demo.library_runs, "figures": listed}

@@ -96,28 +96,26 @@ def _recorded(demo: Demo) -> dict[str, str]:
 def _overrides(demo: Demo, rule: str | None, judged: Path, topics: Mapping[str, str]) -> dict[str, dict[str, Any]]:
     """Parameters on top of the scenario's file; every output waits for all who read it, the recorder of topics, too."""
     file, sensors = demo.bringup.sections, list(demo.scene.sensors)
-    readers = {name: file[name]["expected_subscribers"] + (f"/{name}/tracks" in topics) for name in sensors}
-    overrides: dict[str, dict[str, Any]] = {
-        "evaluator": {"output": str(judged)},
-        "replay": {
-            "seed": demo.seed,
-            "expected_truth_subscribers": 1 + (TRUTH in topics),
-            "expected_subscribers_each": 1 + (f"/replay/{sensors[0]}/detections" in topics),
-        },
+    replay = {
+        "seed": demo.seed,
+        "expected_truth_subscribers": 1 + (TRUTH in topics),
+        "expected_subscribers_each": 1 + (f"/replay/{sensors[0]}/detections" in topics),
     }
+    overrides: dict[str, dict[str, Any]] = {"evaluator": {"output": str(judged)}, "replay": replay}
     if rule is None:
-        overrides[sensors[0]] = {"expected_subscribers": 2}  # replay and evaluator
-        return overrides
-    overrides |= {name: {"expected_subscribers": count} for name, count in readers.items()}
-    of_fused = file["fusion_centre"]["expected_subscribers"] + (FUSED in topics) + demo.many_targets
-    overrides["fusion_centre"] = {"expected_subscribers": of_fused} | _variant(demo, rule)
+        return {**overrides, sensors[0]: {"expected_subscribers": 2}}  # replay and evaluator
+    for name in (*sensors, "fusion_centre"):
+        readers = file[name]["expected_subscribers"] + (f"/{name}/tracks" in topics)
+        overrides[name] = {"expected_subscribers": readers}
+    overrides["fusion_centre"]["expected_subscribers"] += demo.many_targets
+    overrides["fusion_centre"] |= _variant(demo, rule)
     return overrides
 
 
 def _variant(demo: Demo, rule: str) -> dict[str, Any]:
     """Parameters in which a variant differs from the defaults; those of the scenario's own rules are in its file."""
-    choice = demo.choice(rule)
-    if choice is None or not choice.variant:
+    choice = next((c for c in demo.scenario.rules if c.name == rule and c.variant), None)
+    if choice is None:
         return {}
     values = {name: (getattr(choice.params, name), default) for name, (_, default) in specs(choice.params).items()}
     given = {f"{choice.key}.{name}": value for name, (value, default) in values.items() if value != default}

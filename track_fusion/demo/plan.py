@@ -9,18 +9,13 @@ from pathlib import Path
 from track_fusion.demo.wiring import Bringup, bringups
 from track_fusion.params import Fault, unknown_name_error
 from track_fusion.rules import get_rule
-from track_fusion.scenarios import SCENARIOS, RuleChoice, Scenario, Scene, get_scenario
+from track_fusion.scenarios import SCENARIOS, Scenario, Scene, get_scenario
 
 #: How a scenario's rows name what the tracker nodes run.
 ROWS = {
-    "kalman": "kf",
-    "extended": "ekf",
-    "unscented": "ukf",
-    "cubature": "ckf",
-    "particle": "sir",
-    "student_t": "stf",
+    "kalman": "kf", "extended": "ekf", "unscented": "ukf", "cubature": "ckf", "particle": "sir", "student_t": "stf",
     "pda": "pda",
-}
+}  # fmt: skip
 #: Rules that a scenario which has them all is shown with; the last is recorded and drawn.
 RULES = ("naive", "covariance_intersection", "arithmetic_average")
 #: Library runs to compare with where they cost little.
@@ -70,10 +65,6 @@ class Demo:
     def many_targets(self) -> bool:
         """Whether the scenario itself judges what the centre publishes."""
         return self.scenario.judge is not None
-
-    def choice(self, rule: str) -> RuleChoice | None:
-        """The scenario's own choice of parameters under this name."""
-        return next((c for c in self.scenario.rules if c.name == rule), None)
 
 
 def demo_of(name: str, out: Path, seed: int, library_runs: int | None, rules: tuple[str, ...] = ()) -> Demo:

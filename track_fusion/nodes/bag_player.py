@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from track_fusion.bags.read import open_bag
-from track_fusion.nodes.managed import ManagedNode, message_class, qos
+from track_fusion.nodes.managed import ManagedNode, class_of, qos
 from track_fusion.params import Fault, ParameterError, Params, param
 from track_fusion.tracks import SECOND_NS
 
@@ -65,7 +65,7 @@ class BagPlayer:
         wanted = set(params.topics) or known - {"/clock"}
         self._played = [c for c in self._reader.connections if c.topic in wanted]
         self._outputs = {
-            c.id: node.create_publisher(message_class(c.msgtype), names.get(c.topic, c.topic), qos(100))
+            c.id: node.create_publisher(class_of(c.msgtype), names.get(c.topic, c.topic), qos(100))
             for c in self._played
         }
         self.wanted = dict.fromkeys(self._outputs.values(), subscribers_each)
@@ -83,7 +83,8 @@ class BagPlayer:
 
     def _rewind(self) -> None:
         start = self._reader.start_time + round(self._params.start_offset_s * SECOND_NS)
-        self._messages: Iterator[Any] = self._reader.messages(connections=self._played, start=start)
+        # Of no connection the reader would give all messages.
+        self._messages: Iterator[Any] = iter(self._reader.messages(self._played, start) if self._played else ())
         self._next = next(self._messages, None)
         self._origin_ns, self._wall_start = start, time.monotonic()
         if self._next is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import time
 import traceback
 from collections import Counter, deque
@@ -21,6 +20,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from msg_adapters.arrays import MessageError
 from msg_adapters.diagnostics import diagnostic_array
+from msg_adapters.types import message_class
 from track_fusion.nodes.ros_params import declare, refuse_unknown
 from track_fusion.params import Fault, ParameterError, Params, param
 
@@ -51,20 +51,18 @@ def qos(depth: int) -> QoSProfile:
     return QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=depth)
 
 
-def message_class(name: str) -> Any:
+def class_of(kind: str) -> type:
     """Return the class of a type such as sensor_msgs/msg/PointCloud2.
 
     Raises
     ------
     Fault    its package is not installed
     """
-    package, _, kind = name.split("/")
     try:
-        return getattr(importlib.import_module(f"{package}.msg"), kind)
-    except (ImportError, AttributeError):
+        return message_class(kind)
+    except ImportError as error:
         raise Fault(
-            f"The type {name} cannot be had: its package {package} is not installed here. Leave its topics out "
-            "(of a bag: by bag_topics)."
+            f"The type {kind} cannot be had. {error} Or leave its topics out (of a bag: by bag_topics)."
         ) from None
 
 
@@ -95,7 +93,7 @@ class ManagedNode(LifecycleNode):
         backward = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
         self._jump = self.get_clock().create_jump_callback(backward, post_callback=self._on_jump)
         if self.managed.autostart:
-            self.autostart()
+            self._autostart()
 
     # What subclasses fill in.
 
@@ -123,14 +121,8 @@ class ManagedNode(LifecycleNode):
 
     # Lifecycle.
 
-    def autostart(self) -> None:
-        """Configure and activate; rclpy has no such thing.
-
-        Raises
-        ------
-        Fault             a transition failed (an unforeseen error is in the log)
-        ParameterError    it failed because a value is wrong
-        """
+    def _autostart(self) -> None:
+        """Configure and activate; rclpy has no such thing. Raise what made it fail; the log has an unforeseen error."""
         transitions: list[Callable[[], Any]] = [self.trigger_configure, self.trigger_activate]
         for transition in transitions:
             if transition() != TransitionCallbackReturn.SUCCESS:

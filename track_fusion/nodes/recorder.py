@@ -14,7 +14,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from track_fusion.nodes.managed import message_class, qos
+from track_fusion.nodes.managed import class_of, qos
 from track_fusion.params import Fault
 
 #: A recorder that falls behind by more messages of one topic than this loses some, and counts them.
@@ -55,7 +55,7 @@ class Recorder:
             raise Fault(f"{path} exists already; a bag is not overwritten.")
         self._node, self.counts = node, Counter[str]()
         self._early: deque[tuple[Any, bytes]] = deque()
-        classes = {kind: message_class(kind) for kind in topics.values()}
+        classes = {kind: class_of(kind) for kind in topics.values()}
         self._writer = Writer(path, version=9, storage_plugin=plugins[storage])
         self._writer.open()
         store = get_typestore(Stores.ROS2_JAZZY)

@@ -85,7 +85,7 @@ class ScenarioPlayer:
                 raise unknown_name_error(name, self._scene.sensors, "sensor")
         self._step, self._steps = 0, params.steps or self._scene.steps
         draw = params.seed, params.run, self._steps
-        self._states, self._drawn = self._scene.truth(*draw), self._scene.detections(*draw)
+        self._states, self._drawn = self._scene.states(*draw), self._scene.detections(*draw)
         self._truth = node.publisher(Odometry, "~/truth", depth=100)
         self._detections = {name: node.publisher(PointCloud2, f"~/{name}/detections") for name in names}
         self.wanted = dict.fromkeys(self._detections.values(), subscribers_each)

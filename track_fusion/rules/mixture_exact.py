@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.log_domain import log_sum_exp, normalised
-from track_fusion.densities.mixture.mixture import Factored, Mixture, chosen, moments, same, sample
+from track_fusion.densities.mixture.mixture import Factored, Mixture, chosen, moments, same, sample, take_components
 from track_fusion.densities.mixture.proposals import (
     MOST_SPREAD,
     indirect_global_sampling,
@@ -219,25 +219,20 @@ def _dls(problem: Problem, params: MixtureExactParams, rng: np.random.Generator)
     kept = prune_mixands(quotient, bound.log_weight, found.log_moment, params.prune_nats)
 
     def approximate() -> Laplace:
-        return Laplace(*(_take(a, kept.order) for a in found))
+        return Laplace(*(take_components(a, kept.order) for a in found))
 
     def wide(near: Laplace) -> Array:
         """Covariances of the Gaussians above the mixands; where there is none, the widest that heavy tails allow."""
-        sure = _take(bound.sure, kept.order)
-        return np.where(sure[..., None, None], _take(bound.cov, kept.order), MOST_SPREAD * near.cov)
+        sure = take_components(bound.sure, kept.order)
+        return np.where(sure[..., None, None], take_components(bound.cov, kept.order), MOST_SPREAD * near.cov)
 
     mixture, more = sample_mixands(kept, problem.first, problem.second, approximate, wide, params, rng)
     return mixture, info | more
 
 
-def _take(array: NDArray[Any], order: NDArray[np.intp]) -> NDArray[Any]:
-    tail = (1,) * (array.ndim - order.ndim)
-    return np.take_along_axis(array, order.reshape(*order.shape, *tail), order.ndim - 1)
-
-
 def _igs(problem: Problem, params: MixtureExactParams, rng: np.random.Generator) -> Result:
     quotient, _, found, info = _prepared(problem, params)
-    proposal = laplace_proposal(quotient, params.inflation, found)
+    proposal = laplace_proposal(found, params.inflation)
     result = indirect_global_sampling(quotient, proposal, rng, params.samples)
     ess = result.samples.ess / params.samples
     return result.mixture, info | {"ess": ess, "log_eta": result.samples.log_eta}

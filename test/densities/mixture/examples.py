@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from track_fusion.densities.mixture.divergence import grid
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.densities.mixture.quotient import Quotient
+from track_fusion.densities.on_grid import grid
 
 
 def draw(rng: np.random.Generator, *lead: int, count: int = 3, n: int = 2, spread: float = 3.0) -> Mixture:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.study.scenario import Claim
+from track_fusion.study.claims import Claim
 
 #: The rows of a table by their rules, and covariance union's as it is about the mean at which its bound is least.
 RULES = ("alone", "ic", "naive", "arithmetic_average", "covariance_intersection", "covariance_union")
@@ -63,11 +63,11 @@ def below_each(text: str, source: str, first: Sequence[str], second: Sequence[st
 def union_claims(one: str, source: str) -> tuple[Claim, ...]:
     """Covariance union against the other rules, in both readings of its mean."""
     rest = named(POSITION, one, "alone", "ic", AVERAGE, INTERSECTION)
-    found = []
+    claims = []
     for union, about in ((UNION, "about the arithmetic average"), (UNION_ANYWHERE, "about the best mean")):
         name = f"{one.upper()} with covariance union {about}"
         own = named(POSITION, one, union)[0]
-        found += [
+        claims += [
             Claim.greatest(f"{name} is worse than every row but naive fusion", source, own, rest),
             Claim.order(f"{name} is worse than the arithmetic average", source, *named(POSITION, one, AVERAGE), own),
             Claim(
@@ -77,7 +77,7 @@ def union_claims(one: str, source: str) -> tuple[Claim, ...]:
                 lambda first, *others: first.value > max(1.0, *(e.value for e in others)),
             ),
         ]
-    return tuple(found)
+    return tuple(claims)
 
 
 def balance_claims(one: str, source: str) -> tuple[Claim, ...]:
