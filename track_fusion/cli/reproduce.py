@@ -22,7 +22,13 @@ if TYPE_CHECKING:
     from track_fusion.study.study import Result
 
 #: Colours of the verdicts in the table.
-STYLES = {"agrees": "green", "ordering only": "yellow", "does not reproduce": "red", "not given": "dim"}
+STYLES = {
+    "agrees": "green",
+    "contradicts": "red",
+    "undecided": "yellow",
+    "by construction": "dim",
+    "not given": "dim",
+}
 
 
 @click.command(short_help="Repeat published studies: measured beside published.")
@@ -49,13 +55,17 @@ def reproduce(
     NAME is a scenario (`track-fusion scenarios` lists them) or a Python file that defines SCENARIO. Writes
     results.json (figures, claims, the curves of the pictures) and report.html, one page that needs nothing else.
     A run that was interrupted goes on where it was when the same command is given again. Equal seeds give equal
-    figures, but for the times that ahmed-random measures. The verdict on a figure is
+    figures, but for the times that ahmed-random measures. The verdicts are
 
     \b
-      agrees               the difference is within 3 standard deviations, of our runs and the paper's together
-      ordering only        the figure stands to the others of its table as published
-      does not reproduce   neither; of a claim: it is not true of what was measured
-      not given            nothing to compare with, or a single random run, whose error is unknown
+      agrees            a figure within 3 standard deviations, of our runs and the paper's together;
+                        a claim that holds beyond chance: 99.9 %, compared run by run
+      contradicts       a figure further off (its reason may be: in the order published);
+                        a claim that is false beyond chance
+      undecided         these runs cannot tell: a claim within chance or on fewer than 10 runs, a
+                        figure of a single run
+      by construction   it agrees, but no result could contradict it; not counted as agreement
+      not given         nothing to compare with
 
     \b
     Examples:
@@ -141,9 +151,7 @@ def _print_tables(section: Section) -> None:
     if result["claims"]:
         claims = output.table("claim", "verdict", title="claims")
         for c in result["claims"]:
-            claims.add_row(
-                escape(f"{c['claim']} ({evidence_text(c['evidence'])})"), f"[{STYLES[c['verdict']]}]{c['verdict']}[/]"
-            )
+            claims.add_row(escape(f"{c['claim']} ({evidence_text(c['evidence'])})"), _verdict(c))
         out.print("", claims)
     out.print()
     facts = [
@@ -160,7 +168,12 @@ def _table(quantity: str, figures: Sequence[Mapping[str, Any]]) -> Table:
     compared = output.table("filter and rule", "measured", "published", "verdict", title=title)
     compared.columns[1].justify = compared.columns[2].justify = "right"
     for f in figures:
-        verdict = f"[{STYLES[f['verdict']]}]{f['verdict']}[/]"
         measured = measured_text(f["value"], f["standard_error"])
-        compared.add_row(escape(f["name"].rpartition("/")[0]), measured, published_text(f["published"]), verdict)
+        compared.add_row(escape(f["name"].rpartition("/")[0]), measured, published_text(f["published"]), _verdict(f))
     return compared
+
+
+def _verdict(judged: Mapping[str, Any]) -> str:
+    from track_fusion.report.page import verdict_text
+
+    return f"[{STYLES[judged['verdict']]}]{escape(verdict_text(judged))}[/]"

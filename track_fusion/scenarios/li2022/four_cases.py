@@ -166,7 +166,7 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
 
     def measure(choice: RuleChoice) -> Outcomes:
         traces = np.array([np.trace(fused("", choice, seed, r).cov, axis1=1, axis2=2) for r in runs])
-        return {f"trace_case_{case}_m2": traces[:, i] for i, case in enumerate(SEPARATIONS)}
+        return {f"claimed_trace_case_{case}_m2": traces[:, i] for i, case in enumerate(SEPARATIONS)}
 
     return compare_each("given", rules, progress, measure)
 

@@ -179,7 +179,7 @@ def _ellipses(outcomes: Outcomes, row: str, reading: str, label: str) -> list[Se
 def compare(
     network: Network, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress
 ) -> Outcomes:
-    """Fold by any rules: length of the error at the sink, (R,).
+    """Fold by any rules: length of the error at the sink, and NEES over the number of axes, (R,).
 
     Raises
     ------
@@ -189,7 +189,10 @@ def compare(
 
     def measure(choice: RuleChoice) -> Outcomes:
         rngs = [stream(seed, run, "rule") for run in runs]
-        return {"error_1": np.linalg.norm(network.fused(local, choice, rngs).mean - local.state, axis=1)}
+        fused = network.fused(local, choice, rngs)
+        error = fused.mean - local.state
+        scores = nees(error, np.broadcast_to(fused.cov, (*error.shape, error.shape[1]))) / error.shape[1]
+        return {"error_1": np.linalg.norm(error, axis=1), "consistency_1": scores}
 
     return compare_each("kf", rules, progress, measure)
 

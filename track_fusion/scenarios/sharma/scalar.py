@@ -211,7 +211,7 @@ def _bars(outcomes: Outcomes) -> list[Chart]:
 
 
 def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
-    """Run any rules in every setting: root of the squared error averaged over the steps, (R,).
+    """Run any rules in every setting: root of the squared error averaged over the steps, and NEES likewise, (R,).
 
     Raises
     ------
@@ -220,11 +220,13 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
     normals = _normals(runs, seed)
 
     def measure(choice: RuleChoice) -> Outcomes:
-        errors = {}
+        scores = {}
         for setting in SETTINGS:
             rngs = [stream(seed, run, "rule") for run in runs]
-            errors[f"rmse_{setting.name}_1"] = np.sqrt(track(setting, choice, normals, rngs).square.mean(1))
-        return errors
+            tracked = track(setting, choice, normals, rngs)
+            scores[f"rmse_{setting.name}_1"] = np.sqrt(tracked.square.mean(1))
+            scores[f"consistency_{setting.name}_1"] = tracked.nees.mean(1)
+        return scores
 
     return compare_each("kf", rules, progress, measure)
 
