@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +22,7 @@ if TYPE_CHECKING:
 
     from track_fusion.report.page import Section
     from track_fusion.scenarios import Scenario
-    from track_fusion.study.study import Result
+    from track_fusion.study.study import Result, Study
 
 #: Colours of the verdicts in the table.
 STYLES = {
@@ -38,6 +41,8 @@ STYLES = {
     "--runs", type=click.IntRange(min=1), help="Monte Carlo runs.  [default: the scenario's own, a quick look]"
 )
 @click.option("--publication", is_flag=True, help="As many runs as figures to be quoted need (hours for --all).")
+@click.option("--until-decided", "limit", metavar="RUNS", type=click.IntRange(min=1),
+              help="Go on with more runs, up to so many, while a claim or a figure is undecided.")  # fmt: skip
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the random streams.")
 @click.option("--only", default="", metavar="PREFIX", help="Only rows whose names start so, such as kf- (much faster).")
 @click.option(
@@ -47,8 +52,8 @@ STYLES = {
               help="Where results.json and report.html, which are replaced, and finished pieces go.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON: one object, or a list of them for several names.")
 def reproduce(
-    names: tuple[str, ...], every: bool, runs: int | None, publication: bool, seed: int, only: str, jobs: int | None,
-    out: Path, as_json: bool,
+    names: tuple[str, ...], every: bool, runs: int | None, publication: bool, limit: int | None, seed: int, only: str,
+    jobs: int | None, out: Path, as_json: bool,
 ) -> None:  # fmt: skip
     """Run published scenarios in the library and set what was measured beside what was published.
 
@@ -71,6 +76,7 @@ def reproduce(
     Examples:
       track-fusion reproduce li2022-linear
       track-fusion reproduce li2022-linear --only kf- --runs 1000
+      track-fusion reproduce sharma-radars --until-decided 100
       track-fusion reproduce --all --out out/all
       track-fusion reproduce ./my_scenario.py --json
     """  # noqa: D301  click reads \b as "do not wrap"
@@ -93,8 +99,9 @@ def reproduce(
     chosen = tuple(SCENARIOS) if every else tuple(dict.fromkeys(names))
     studies = [Study(name, find_scenario, wanted(find_scenario(name)), seed, only) for name in chosen]
     sections = []
-    for result in results(studies, jobs or os.cpu_count() or 1, out / "pieces"):
-        sections.append(_section(result))
+    run = partial(results, jobs=jobs or os.cpu_count() or 1, store=out / "pieces", told=True)
+    for section in map(_section, run(studies)) if limit is None else _until_decided(studies, limit, run):
+        sections.append(section)
         if not as_json:
             _print_tables(sections[-1])
     _write(out, sections)
@@ -103,6 +110,25 @@ def reproduce(
         output.print_json(answers[0] if len(answers) == 1 else answers)
     else:
         click.echo(f"Written: {out / 'report.html'}, {out / 'results.json'}")
+
+
+def _until_decided(
+    studies: Sequence[Study], limit: int, run: Callable[[Sequence[Study]], Iterator[Result]]
+) -> Iterator[Section]:
+    """Run each study with ever more runs, at most so many, until no verdict is undecided; what is done is kept."""
+    for study in studies:
+        (result,) = run([study])
+        section = _section(result)
+        while section.scenario.random and study.runs < limit and _is_undecided(section):
+            pieces = ceil(2 * study.runs / section.scenario.piece)
+            study = dataclasses.replace(study, runs=min(pieces * section.scenario.piece, limit))
+            (result,) = run([study])
+            section = _section(result)
+        yield section
+
+
+def _is_undecided(section: Section) -> bool:
+    return any(judged["verdict"] == "undecided" for key in ("claims", "figures") for judged in section.result[key])
 
 
 def _section(result: Result) -> Section:
