@@ -25,24 +25,28 @@ def surely_positive(values: Array, tail: float = TAIL) -> bool:
     values : (R,)    one a run, independent; where all are the same, nothing is left to chance
     tail : float     probability of a wrong yes
 
-    Notes    By the t interval, and where the values are skewed by the signed ranks (Wilcoxon) too: there the interval
-             of a few runs misses the rare ones that make the mean. From less than LEAST_RUNS runs nothing is sure.
+    Notes    By the t interval. Where the values are skewed it misses the rare runs that make the mean: there the signed
+             ranks (Wilcoxon) must say the same, and so must the interval corrected for the skewness (Johnson), which
+             makes wrong answers some four times rarer when the rare runs are low ones. From less than LEAST_RUNS runs
+             nothing is sure.
+
+    References
+    ----------
+    N. J. Johnson, Modified t tests and confidence intervals for asymmetrical populations, 1978, (2.6)
     """
     from scipy.special import stdtrit
 
     runs, mean = len(values), float(values.mean())
     if runs < LEAST_RUNS or not mean > 0.0:
         return False
-    spread = float(values.std(ddof=1))
-    if mean <= float(stdtrit(runs - 1, 1.0 - tail)) * spread / np.sqrt(runs):
-        return False
-    return not _is_skewed(values) or rank_sigmas(values) > RANK_SIGMAS
-
-
-def _is_skewed(values: Array) -> bool:
-    deviation = values - values.mean()
-    spread = np.sqrt((deviation**2).mean())
-    return bool(abs((deviation**3).mean()) > SKEWED * np.sqrt(len(values)) * spread**3)
+    deviation = values - mean
+    variance = float((deviation**2).sum()) / (runs - 1)
+    limit = float(stdtrit(runs - 1, 1.0 - tail)) * np.sqrt(variance / runs)
+    third = float((deviation**3).sum()) * runs / ((runs - 1) * (runs - 2))
+    if mean <= limit or abs(third) <= SKEWED * np.sqrt(runs * variance**3):
+        return mean > limit
+    correction = third / variance * (1.0 / (6.0 * runs) + mean**2 / (3.0 * variance))
+    return rank_sigmas(values) > RANK_SIGMAS and mean + min(correction, 0.0) > limit
 
 
 def rank_sigmas(values: Array) -> float:

@@ -78,14 +78,16 @@ def judged_claim(claim: Claim, figures: Sequence[Estimate]) -> Judgement:
     unknown = [e for e in figures if e.left_out is None and e.standard_error != 0.0]
     if unknown:
         return Judgement(UNDECIDED, "a single run" if unknown[0].runs == 1 else "its error is not known")
-    random = [e for e in figures if e.left_out is not None]
-    points = _points(figures, random[0].runs if random else 0)
+    runs = {len(e.left_out) for e in figures if e.left_out is not None}
+    if len(runs) > 1:
+        return Judgement(UNDECIDED, "figures of different runs")
+    points = _points(figures, max(runs, default=0))
     with np.errstate(invalid="ignore", divide="ignore"):
         margins = np.array([np.broadcast_to(m, points.shape[1]) for m in claim.margins(*points)], float)
     if not np.isfinite(margins).all():
         return Judgement(UNDECIDED, "not defined without some of the runs")
     margins[(np.abs(margins) <= ROUNDING * np.abs(points).max()).all(1)] = 0.0
-    judgement = _by_runs(margins) if random else _at_once(margins)
+    judgement = _by_runs(margins) if runs else _at_once(margins)
     if judgement.verdict == AGREES and claim.by_construction:
         return Judgement(BY_CONSTRUCTION, claim.by_construction)
     return judgement
