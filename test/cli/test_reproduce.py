@@ -27,8 +27,7 @@ from pathlib import Path
 import numpy as np
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.claims import Claim
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Claim, Scenario
 
 def simulate(runs, seed, progress, only=""):
     Path(__file__).with_suffix(f".asked-{seed}-{runs.start}-{runs.stop}").touch()

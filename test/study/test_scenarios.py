@@ -13,10 +13,9 @@ from track_fusion.params import ParameterError
 from track_fusion.rules import RULES, SourceTracks
 from track_fusion.scenarios import SCENARIOS, get_scenario, judged_figures
 from track_fusion.scenarios.ahmed import search as ahmed_search
-from track_fusion.study.claims import Claim, Printed
 from track_fusion.study.judgement import verdict
 from track_fusion.study.rule_choice import RuleChoice, check_needs, compare_each, fuse_runs
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Claim, Printed, Scenario
 
 # ---- rules over runs that share their covariances --------------------------------------------------------------------
 

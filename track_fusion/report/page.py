@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 
 from track_fusion.report.drawing import svg
 from track_fusion.study.chart import Chart
-from track_fusion.study.claims import Printed
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Printed, Scenario
 
 VERDICTS = ("agrees", "ordering only", "does not reproduce", "not given")
 #: Units whose names in figures lack signs.

@@ -8,8 +8,7 @@ from decimal import Decimal
 from typing import Any
 
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.study.claims import Printed
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Printed, Scenario
 
 #: A figure agrees within so many standard deviations of the difference.
 AGREEMENT_SIGMAS = 3.0

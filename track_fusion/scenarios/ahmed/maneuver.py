@@ -30,10 +30,9 @@ from track_fusion.scenarios.ahmed.platforms import (
     truths,
 )
 from track_fusion.study.chart import Chart, Series, ellipse
-from track_fusion.study.claims import Claim
 from track_fusion.study.rows import Outcomes, Progress, chosen
 from track_fusion.study.rule_choice import RuleChoice
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Claim, Scenario
 
 IGS = MixtureWepParams(criterion="minimax_information_loss", method="igs", samples=1000, max_components=COMPONENTS)
 RULE_CHOICES = (

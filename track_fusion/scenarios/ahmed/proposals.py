@@ -42,10 +42,9 @@ from track_fusion.scenarios.ahmed.mixtures import (
     shown,
 )
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.claims import Claim, Printed
 from track_fusion.study.rows import Outcomes, Progress, chosen, run_by_run
 from track_fusion.study.rule_choice import RuleChoice
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Claim, Printed, Scenario
 
 #: Fig. 7: divergence in nats of the true fused density from each approximation, one problem.
 FIGURE_7 = {

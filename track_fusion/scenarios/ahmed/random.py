@@ -25,10 +25,9 @@ from track_fusion.scenarios.ahmed.mixtures import (
     shown,
 )
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.claims import Claim, Printed
 from track_fusion.study.rows import Outcomes, Progress, chosen, run_by_run
 from track_fusion.study.rule_choice import RuleChoice
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Claim, Printed, Scenario
 
 #: Figs. 4 and 5, one problem: divergence in nats of the true fused density from each approximation.
 FIGURES_4_5 = {
@@ -227,12 +226,13 @@ def _claims() -> Iterator[Claim]:
         figure, rough = ("Fig. 6(a)", "mmgd") if kind == "exact" else ("Fig. 6(b)", "foci")
         yield Claim.order(f"{kind} fusion by DLS improves with the samples", figure, *_names(key, *reversed(dls)))
         yield Claim.order(f"{kind} fusion by IGS improves with the samples", figure, *_names(key, *reversed(igs)))
-        yield Claim(
+        yield Claim.each(
             f"{kind} fusion: DLS is more accurate than IGS in nearly all cases (judged: in the median at each of the "
             "four numbers of samples)",
             figure,
-            _names(key, *dls, *igs),
-            lambda *all_: all(a.value < b.value for a, b in zip(all_[:4], all_[4:], strict=True)),
+            _names(key, *dls),
+            _names(key, *igs),
+            float.__lt__,
         )
         yield Claim(
             f"{kind} fusion: DLS and IGS improve on {rough.upper()} (judged: with each of their numbers of samples)",

@@ -24,10 +24,9 @@ from track_fusion.rules.mixture_exact import MixtureExactParams
 from track_fusion.rules.mixture_wep import MixtureWepParams
 from track_fusion.scenarios.ahmed import PAPER
 from track_fusion.study.chart import Chart, Contours, Series, bars
-from track_fusion.study.claims import Claim
 from track_fusion.study.rows import Outcomes, Progress, chosen, run_by_run
 from track_fusion.study.rule_choice import RuleChoice
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Claim, Scenario
 from track_fusion.tracks import StateLayout
 
 #: Text of 5.3 and caption of Fig. 9: divergence of robot 3's fused mixture from the centralised one.

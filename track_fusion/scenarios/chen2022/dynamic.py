@@ -28,11 +28,10 @@ from track_fusion.rules.mhdp_iterative import MhdpIterativeParams
 from track_fusion.rules.quasi_minimal_manhattan import QuasiMinimalManhattanParams
 from track_fusion.scenarios.chen2022 import PAPER
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.claims import Claim
 from track_fusion.study.one_target import drawn, fused_row, same_filters
 from track_fusion.study.rows import Outcomes, Progress, chosen
 from track_fusion.study.rule_choice import RuleChoice, check_needs
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Claim, Scenario
 from track_fusion.study.scene import Tracking
 from track_fusion.tracks import StateLayout
 

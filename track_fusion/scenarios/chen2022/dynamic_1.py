@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from track_fusion.scenarios.chen2022.dynamic import SENSOR_1, SENSOR_2, scenario, tracking
-from track_fusion.study.claims import Printed
+from track_fusion.study.scenario import Printed
 
 #: Table 1, case I: position ARMSE in metres by DCI, GP, FCI, KLA, QMMHD, MHDP-E and MHDP-I.
 TABLE_1 = {

@@ -23,10 +23,9 @@ from track_fusion.rules.quasi_minimal_manhattan import QuasiMinimalManhattanPara
 from track_fusion.rules.shared.elliptical import EllipticalParams
 from track_fusion.scenarios.chen2022 import PAPER
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.claims import Claim
 from track_fusion.study.rows import Outcomes, Progress, exact_rows
 from track_fusion.study.rule_choice import RuleChoice, compare_each
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Claim, Scenario
 
 #: The local estimates of 5.1: means, and scatters (scalar: the squares of scale parameters).
 MEANS, SCATTERS = np.array([2.0, 4.0]), np.array([5.0, 7.0])

@@ -171,10 +171,10 @@ def density_average(densities: Array, width: Array, weights: Array, geometric: b
     return np.asarray(average / mass)
 
 
-def density_moments(nodes: Array, density: Array, width: Array, truth: float | None = None) -> tuple[Array, Array]:
-    """Mean and variance of a density on a grid, or mean and mean square error (3) about `truth`."""
+def density_moments(nodes: Array, density: Array, width: Array) -> tuple[Array, Array]:
+    """Mean and variance of a density on a grid."""
     mean = (nodes * density) @ width
-    return np.asarray(mean), np.asarray(((nodes - (mean if truth is None else truth)) ** 2 * density) @ width)
+    return np.asarray(mean), np.asarray(((nodes - mean) ** 2 * density) @ width)
 
 
 def _check_weights(weights: Array) -> None:

@@ -17,10 +17,9 @@ from track_fusion.scenarios.li2019 import PAPER
 from track_fusion.scenarios.li2019.averages import density_average, density_moments
 from track_fusion.scenarios.li2019.common import fuse
 from track_fusion.study.chart import Chart, Contours, Series
-from track_fusion.study.claims import Claim
 from track_fusion.study.rows import Outcomes, Progress, exact_figures, exact_rows
 from track_fusion.study.rule_choice import RuleChoice
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Claim, Scenario
 
 #: Weights of the first density, the ends apart, and values of the parameter.
 WEIGHT = np.linspace(0.0, 1.0, 101)[1:-1]

@@ -20,10 +20,9 @@ from track_fusion.scenarios.li2019.common import (
     scalar_mixture,
 )
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.claims import Claim
 from track_fusion.study.rows import Outcomes, Progress, exact_figures, exact_rows
 from track_fusion.study.rule_choice import RuleChoice
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Claim, Scenario
 
 #: GM 1 and GM 2, the second padded by a component of weight 0.
 PARTS = scalar_mixture(

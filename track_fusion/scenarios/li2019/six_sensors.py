@@ -24,10 +24,9 @@ from track_fusion.scenarios.li2019.common import (
     scalar_mixture,
 )
 from track_fusion.study.chart import Chart, Series, estimates
-from track_fusion.study.claims import Claim
 from track_fusion.study.rows import Outcomes, Progress, chosen, row_by_row
 from track_fusion.study.rule_choice import RuleChoice, compare_each
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Claim, Scenario
 
 TARGETS = np.array([20.0, 40.0, 70.0, 110.0, 200.0])
 SENSORS = 6

@@ -21,9 +21,8 @@ from track_fusion.scenarios.li2019.averages import (
 )
 from track_fusion.scenarios.li2019.variable_pairs import MEAN, VARIANCES, Variables, normal_pair, poisson_pair
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.claims import Claim
 from track_fusion.study.rows import Outcomes, Progress, chosen, exact_rows
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Claim, Scenario
 
 #: Pairs of variables drawn in one run: what fits the cache at all weights.
 PAIRS = 1000
@@ -254,19 +253,14 @@ def _error_lines(variant: str) -> list[tuple[str, str, str]]:
 TIE = 1e-9
 
 
-def _no_greater(*estimates: Estimate) -> bool:
-    """Tell whether the first half of the figures are no greater than the second half, one by one."""
-    half = len(estimates) // 2
-    pairs = zip(estimates[:half], estimates[half:], strict=True)
-    return all(a.value <= b.value * (1.0 + TIE) for a, b in pairs)
+def _no_greater(text: str, source: str, variants: Sequence[str], quantity: str) -> Claim:
+    """Claim that a figure of the arithmetic average is no greater than that of the geometric, variant by variant."""
+    first, second = ([f"{average}@{v}/{quantity}" for v in variants] for average in AVERAGES)
+    return Claim.each(text, source, first, second, lambda a, b: a <= b * (1.0 + TIE))
 
 
 def _some_of_both(*shares: Estimate) -> bool:
     return all(0.0 < s.value < 1.0 for s in shares)
-
-
-def _pairs(variants: Sequence[str], quantity: str) -> tuple[str, ...]:
-    return tuple(f"{average}@{v}/{quantity}" for average in AVERAGES for v in variants)
 
 
 def _error_claims(truth: int) -> tuple[Claim, Claim]:
@@ -279,12 +273,12 @@ def _error_claims(truth: int) -> tuple[Claim, Claim]:
             shares,
             _some_of_both,
         ),
-        Claim(
+        _no_greater(
             f"Parameter {truth}: the least mean square error of the arithmetic average is no greater than that of "
             "the geometric.",
             "Remark 3",
-            _pairs(("rho0", "rho70736"), f"least_mse_theta{truth}_1"),
-            _no_greater,
+            ("rho0", "rho70736"),
+            f"least_mse_theta{truth}_1",
         ),
     )
 
@@ -323,17 +317,17 @@ CLAIMS = (
         )
         for kind, figure, variants in (("Normal", "Fig. 1", FIGURE_1), ("Poisson", "Fig. 2", FIGURE_2))
     ),
-    Claim(
+    _no_greater(
         "In Figs. 1 and 2 the least variance of the arithmetic average is no greater than that of the geometric.",
         "Remark 2",
-        _pairs(FIGURE_1 + FIGURE_2, "least_variance_1"),
-        _no_greater,
+        FIGURE_1 + FIGURE_2,
+        "least_variance_1",
     ),
-    Claim(
+    _no_greater(
         "So it is for any two variables (here two independent lognormal ones of log-variance 1).",
         "6, v-fusion, conclusion 2",
-        _pairs(("lognormal",), "least_variance_1"),
-        _no_greater,
+        ("lognormal",),
+        "least_variance_1",
     ),
     *(claim for truth in TRUTHS for claim in _error_claims(truth)),
     Claim(

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.study.claims import Claim
+from track_fusion.study.scenario import Claim
 
 #: The rows of a table by their rules, and covariance union's as it is about the mean at which its bound is least.
 RULES = ("alone", "ic", "naive", "arithmetic_average", "covariance_intersection", "covariance_union")
@@ -48,16 +46,6 @@ def close(text: str, source: str, share: float, to: str, *others: str) -> Claim:
         return all(abs(value - wanted) <= share * wanted for value in values)
 
     return Claim(text, source, (to, *others), holds)
-
-
-def below_each(text: str, source: str, first: Sequence[str], second: Sequence[str]) -> Claim:
-    """Claim that figures are less than their counterparts, one by one."""
-
-    def holds(*estimates: Estimate) -> bool:
-        half = len(estimates) // 2
-        return all(a.value < b.value for a, b in zip(estimates[:half], estimates[half:], strict=True))
-
-    return Claim(text, source, (*first, *second), holds)
 
 
 def union_claims(one: str, source: str) -> tuple[Claim, ...]:

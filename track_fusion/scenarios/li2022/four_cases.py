@@ -21,10 +21,9 @@ from track_fusion.rules.inverse_covariance_intersection import InverseCovariance
 from track_fusion.rules.naive import NaiveParams
 from track_fusion.scenarios.li2022 import PAPER
 from track_fusion.study.chart import Chart, ellipse
-from track_fusion.study.claims import Claim
 from track_fusion.study.rows import Outcomes, Progress, chosen, row_by_row
 from track_fusion.study.rule_choice import RuleChoice, compare_each
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Claim, Scenario
 
 #: The densities of Fig. 1 are not printed. This pair is assumed: trace-optimal covariance intersection gives it the
 #: paper's weight w1 = .3764.

@@ -17,7 +17,6 @@ from track_fusion.scenarios.li2022.claims import (
     POSITION,
     VELOCITY,
     balance_claims,
-    below_each,
     close,
     named,
     union_claims,
@@ -26,11 +25,10 @@ from track_fusion.scenarios.li2022.claims import (
 from track_fusion.scenarios.li2022.claims import (
     RULES as ROWS,
 )
-from track_fusion.study.claims import Claim, Printed
 from track_fusion.study.one_target import RULE_CHOICES, Row, alone_row, fused_row, same_filters, sir_rows
 from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
 from track_fusion.study.rule_choice import RuleChoice
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Claim, Printed, Scenario
 from track_fusion.study.scene import Tracking
 from track_fusion.tracks import planar_layout
 
@@ -99,11 +97,12 @@ def _claims() -> tuple[Claim, ...]:
             f"kf-ic/{POSITION}",
             [n for one in ("kf", "sir") for n in named(POSITION, one, *ROWS) if n != f"kf-ic/{POSITION}"],
         ),
-        below_each(
+        Claim.each(
             "the Kalman filter does better than the particle filter with every rule and alone",
             "IV-A",
             named(POSITION, "kf", *ROWS),
             named(POSITION, "sir", *ROWS),
+            float.__lt__,
         ),
         Claim(
             "KF-IC is Bayes-optimal: what it claims is its mean squared error (credibility within 5 % of 1)",

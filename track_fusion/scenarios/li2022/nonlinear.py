@@ -16,17 +16,15 @@ from track_fusion.scenarios.li2022.claims import (
     POSITION,
     UNION,
     balance_claims,
-    below_each,
     close,
     named,
     union_claims,
     weight_claims,
 )
-from track_fusion.study.claims import Claim, Printed
 from track_fusion.study.one_target import RULE_CHOICES, Row, alone_row, fused_row, same_filters, sir_rows
 from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
 from track_fusion.study.rule_choice import RuleChoice
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Claim, Printed, Scenario
 from track_fusion.study.scene import Tracking
 from track_fusion.tracks import StateLayout
 
@@ -107,11 +105,12 @@ def _claims() -> tuple[Claim, ...]:
             f"sir-{UNION}/{POSITION}",
             f"sir-ic/{POSITION}",
         ),
-        below_each(
+        Claim.each(
             "the particle filter does better than the cubature filter with every rule and alone, except IC",
             "IV-B",
             named(POSITION, "sir", *but_ic),
             named(POSITION, "ckf", *but_ic),
+            float.__lt__,
         ),
         Claim.order("the weight on sensor 1 falls from the first step to the last", "IV-B, Fig. 11", *last, *first),
         *weight_claims("ckf", "IV-B, Fig. 11"),

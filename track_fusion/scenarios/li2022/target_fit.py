@@ -16,10 +16,9 @@ from track_fusion.rules import FusedTracks, SourceTracks
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.scenarios.li2022 import PAPER
 from track_fusion.study.chart import Chart, Series, Style
-from track_fusion.study.claims import Claim
 from track_fusion.study.rows import Outcomes, Progress, exact_rows
 from track_fusion.study.rule_choice import RuleChoice, compare_each
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Claim, Scenario
 
 #: Section III-B: mean and variance of the densities and of the target in each case.
 DENSITIES = np.array([[40.0, 400.0], [50.0, 200.0], [60.0, 100.0], [100.0, 400.0]])

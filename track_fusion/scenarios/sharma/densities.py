@@ -46,9 +46,9 @@ class Pair:
 
     parts: Mixture
 
-    def log_mean(self, points: Array, kind: Kind, weights: Sequence[float] = HALF) -> Array:
+    def log_mean(self, points: Array, kind: Kind) -> Array:
         """Logarithm (S,) of the harmonic or geometric mean density, not normalised, at points (S, 2)."""
-        return log_mean_density(log_pdf(self.parts, points[None]), np.asarray(weights, float), kind)
+        return log_mean_density(log_pdf(self.parts, points[None]), np.array(HALF), kind)
 
     def by_rule(self, choice: RuleChoice) -> Row:
         """Fuse by a rule."""

@@ -20,9 +20,9 @@ from track_fusion.rules.harmonic_mean import HarmonicMeanParams
 from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
 from track_fusion.rules.naive import NaiveParams
 from track_fusion.study.chart import Chart, Series, ellipse
-from track_fusion.study.claims import Claim
 from track_fusion.study.rows import Outcomes, Progress, chosen
 from track_fusion.study.rule_choice import RuleChoice, compare_each, fuse_runs
+from track_fusion.study.scenario import Claim
 
 RULE_CHOICES = (
     RuleChoice("naive", NaiveParams()),

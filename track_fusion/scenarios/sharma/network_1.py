@@ -19,9 +19,8 @@ from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import network as shared
 from track_fusion.scenarios.sharma.network import RULE_CHOICES, Local, Network, common_claims
 from track_fusion.study.chart import Chart
-from track_fusion.study.claims import Claim
 from track_fusion.study.rows import Outcomes, Progress
-from track_fusion.study.scenario import Scenario
+from track_fusion.study.scenario import Claim, Scenario
 
 NODES = 10
 #: The prior of the state, and of every node.
