@@ -229,12 +229,12 @@ def sensor_tracker_sections() -> list[Section]:
     from track_fusion.nodes.managed import ManagedParams
     from track_fusion.nodes.screening import FrameParams
     from track_fusion.nodes.sensor_tracker import FeedbackParams, OutputParams
-    from track_fusion.trackers.filters import TRACK_FILTERS
+    from track_fusion.trackers.filters import FILTERS
     from track_fusion.trackers.many_targets import PdaTracker, PdaTrackerParams
     from track_fusion.trackers.one_target import MULTI_TARGET, SensorTrackerParams, TrackerChoice
 
     default = TrackerChoice()
-    filters: dict[str, Choice[Any]] = {**TRACK_FILTERS, MULTI_TARGET: Choice(PdaTrackerParams, PdaTracker)}
+    filters: dict[str, Choice[Any]] = {**FILTERS, MULTI_TARGET: Choice(PdaTrackerParams, PdaTracker)}
     return [
         *map(Section, (FrameParams, TrackerChoice)),
         *_alternatives("motion", MOTIONS.own, default.motion),

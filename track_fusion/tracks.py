@@ -18,7 +18,7 @@ from track_fusion.linalg import (
     Array,
     is_positive_definite,
     is_well_conditioned,
-    outer,
+    merged_moments,
     symmetrise,
     transpose,
 )
@@ -239,10 +239,7 @@ class TrackBatch:
         """Mean (N, n) and covariance (N, n, n) of each track, its mixture merged."""
         if self.components == 1:
             return self.mean[:, 0], self.cov[:, 0]
-        weight = self.weight / self.weight.sum(1, keepdims=True)
-        mean = np.einsum("nc,nci->ni", weight, self.mean)
-        spread = self.cov + outer(self.mean - mean[:, None])
-        return mean, np.einsum("nc,ncij->nij", weight, spread)
+        return merged_moments(self.mean, self.cov, self.weight / self.weight.sum(1, keepdims=True))
 
     @cached_property
     def well_conditioned(self) -> NDArray[np.bool_]:

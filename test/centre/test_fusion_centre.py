@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 from oracles.fusion_centre import Settings, arithmetic_average, covariance_intersection, naive, run_centre
+from oracles.kalman import predict, update
 from scipy.stats import chi2
 
 from track_fusion.centre.centre import FusionCentre
 from track_fusion.centre.config import CentreConfig, FusionCentreParams, SourceConfig, TrackManagerParams
-from track_fusion.filters.kalman import predict, update
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
 from track_fusion.params import ParameterError

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from track_fusion.densities.mixture.mixture import Mixture
-from track_fusion.filters.negative_information import update
+from track_fusion.filters.negative_information import NegativeInformation
 from track_fusion.models.detection import SoftmaxDetector
 from track_fusion.tracks import StateLayout, planar_layout
 
@@ -16,6 +16,10 @@ PRIOR = Mixture(
     np.array([[1.5, 0.2], [-2.0, 1.0], [4.0, 3.0]]),
     np.array([[[1.0, 0.3], [0.3, 0.5]], [[2.0, 0.0], [0.0, 0.3]], [[0.2, 0.0], [0.0, 0.2]]]),
 )
+
+
+def update(mixture, detector, chance, **params):
+    return NegativeInformation(**params).update(mixture, chance, detector)
 
 
 def grid(size=241, half=9.0):

@@ -19,8 +19,8 @@ from ros_helpers import NodeProcess, Probe, own_domain
 from sensor_msgs.msg import PointCloud2
 
 from track_fusion.demo.bringup import Nodes, local_environment, running, start_scenario
-from track_fusion.scenarios import get_scenario
 from track_fusion.scenarios.li2022 import linear as li2022_linear
+from track_fusion.study.one_target import drawn
 
 SCENARIO = "li2022-linear"
 FUSED = "/fusion_centre/tracks"
@@ -173,15 +173,8 @@ def start_relayed(nodes: Nodes, overrides: Mapping[str, Mapping[str, Any]], step
 def library(rule: str | None) -> NDArray[np.float64]:
     """Run the library on the same draws: estimated states of all steps, (T, n)."""
     tracking = li2022_linear.TRACKING
-    truth = tracking.truth(SEED, RUN)
-    drawn = tracking.measurements(truth, SEED, RUN)
-    seen = [drawn[name][None] for name in tracking.sensors]
-    if rule is None:
-        estimates = li2022_linear.one_filter(seen[:1])
-    else:
-        choice = next(c for c in get_scenario(SCENARIO).rules if c.name == rule)
-        estimates = li2022_linear.fused_filters(choice, seen)
-    return np.array([fused.mean[0] for fused in estimates])
+    row = li2022_linear.kalman_rows()[f"kf-{rule or 'alone'}"]
+    return np.array([fused.mean[0] for fused in row.estimates(drawn(tracking, [RUN], SEED))])
 
 
 def compare_with_library(messages: list[PointCloud2], rule: str | None) -> None:

@@ -20,30 +20,18 @@ from ros_helpers import Probe
 from sensor_msgs.msg import PointCloud2
 
 from msg_adapters.arrays import merged
-from track_fusion.demo.bringup import local_environment, running, start_scenario
-from track_fusion.demo.wiring import Bringup, bringups
-from track_fusion.filters import extended
+from track_fusion.demo.bringup import Bringup, bringups, local_environment, running, start_scenario
 from track_fusion.rules import RULES, get_rule
 from track_fusion.scenarios import RuleChoice, get_scenario
 from track_fusion.scenarios.chen2022.dynamic import fusions
 from track_fusion.scenarios.li2022 import linear as li2022_linear
 from track_fusion.scenarios.li2022 import nonlinear as li2022_nonlinear
 from track_fusion.scenarios.sharma import radar_runs as sharma_radar_runs
-from track_fusion.study.one_target import (
-    GaussianFilter,
-    Row,
-    Sir,
-    drawn,
-    gaussian_alone,
-    gaussian_fused,
-    sir_alone,
-    sir_fused,
-)
+from track_fusion.study.one_target import Row, alone_row, drawn, fused_row, sir_filters
 
 SEED, RUN = 5, 2
 RUN_S = 300.0  # a run takes 5 s on two idle cores; tests of others may be running
 TOLERANCE = 1e-9
-KF = GaussianFilter(extended.predict, extended.update)
 
 
 class Case(NamedTuple):
@@ -68,20 +56,20 @@ def li2022() -> Iterator[Case]:
     linear, nonlinear, ckf = li2022_linear.TRACKING, li2022_nonlinear.TRACKING, li2022_nonlinear.CKF
     average, uniform = "arithmetic_average", {"covariance_intersection.criterion": "uniform"}
     sampled = RuleChoice("geometric_mean_sampling", RULES["geometric_mean_sampling"].params())
-    yield Case("li2022-linear", sampled.key, "", gaussian_fused(linear, KF, sampled))
-    yield Case("li2022-linear-sir", average, "sir-arithmetic_average",
-               sir_fused(linear, li2022_linear.SIR, choice("li2022-linear", average), union=True))  # fmt: skip
+    yield Case("li2022-linear", sampled.key, "", fused_row(linear, li2022_linear.KF, sampled))
+    joined = fused_row(linear, sir_filters(li2022_linear.SIR), choice("li2022-linear", average), join=True)
+    yield Case("li2022-linear-sir", average, "sir-arithmetic_average", joined)
     for rule in ("naive", average):
-        row = gaussian_fused(nonlinear, ckf, choice("li2022-nonlinear", rule))
+        row = fused_row(nonlinear, ckf, choice("li2022-nonlinear", rule))
         yield Case("li2022-nonlinear", rule, f"ckf-{rule}", row)
     ci = choice("li2022-nonlinear", "covariance_intersection@uniform")
-    yield Case("li2022-nonlinear", ci.key, f"ckf-{ci.name}", gaussian_fused(nonlinear, ckf, ci), uniform)
-    yield Case("li2022-nonlinear", None, "ckf-alone", gaussian_alone(nonlinear, ckf, 1))
-    sir: Sir = li2022_nonlinear.SIR
-    joined = sir_fused(nonlinear, sir, choice("li2022-nonlinear", average), union=True)
+    yield Case("li2022-nonlinear", ci.key, f"ckf-{ci.name}", fused_row(nonlinear, ckf, ci), uniform)
+    yield Case("li2022-nonlinear", None, "ckf-alone", alone_row(nonlinear, ckf, 1))
+    sir = sir_filters(li2022_nonlinear.SIR)
+    joined = fused_row(nonlinear, sir, choice("li2022-nonlinear", average), join=True)
     yield Case("li2022-nonlinear-sir", average, "sir-arithmetic_average", joined)
-    yield Case("li2022-nonlinear-sir", ci.key, f"sir-{ci.name}", sir_fused(nonlinear, sir, ci), uniform)
-    yield Case("li2022-nonlinear-sir", None, "sir-alone", sir_alone(nonlinear, sir, 1))
+    yield Case("li2022-nonlinear-sir", ci.key, f"sir-{ci.name}", fused_row(nonlinear, sir, ci), uniform)
+    yield Case("li2022-nonlinear-sir", None, "sir-alone", alone_row(nonlinear, sir, 1))
 
 
 def chen2022() -> Iterator[Case]:
@@ -152,13 +140,13 @@ def test_the_nodes_give_the_numbers_of_the_library(
     assert tracking is not None
     step_ns, axes = round(tracking.dt_s * 1e9), tracking.motion.layout.axes
     assert [stamp_ns(m) for m in messages] == [k * step_ns for k in range(1, tracking.steps + 1)]
-    truth, draws = drawn(tracking, [RUN], SEED)
+    draws = drawn(tracking, [RUN], SEED)
     expected = np.array([fused.mean[0] for fused in case.library.estimates(draws)])
     estimated = np.array([merged(read(m), axes)[0][0] for m in messages])
     scale = np.abs(expected).max(0)
     np.testing.assert_allclose(estimated / scale, expected / scale, rtol=0, atol=TOLERANCE)
     assert (judged["times"], judged["missed"], judged["false"]) == (tracking.steps, 0, 0)
-    compare_figures(case, judged["all"], estimated - truth[0, 1:])
+    compare_figures(case, judged["all"], estimated - draws.truth[0, 1:])
 
 
 def compare_figures(case: Case, judged: dict[str, Any], error: NDArray[np.float64]) -> None:

@@ -4,12 +4,12 @@ import doctest
 
 import numpy as np
 import pytest
+from oracles.kalman import predict, update
 
 import track_fusion.peers
 from track_fusion.densities.mixture.algebra import LogMixture, product
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf, stacked
 from track_fusion.densities.on_grid import grid, kl_on_grid
-from track_fusion.filters.kalman import predict, update
 from track_fusion.peers import Peer, Schedule, by_rule, communicate, gaussian, on_tree, ring, star, sweep
 from track_fusion.rules import RULES, SourceTracks
 from track_fusion.rules.mixture_exact import MixtureExactParams

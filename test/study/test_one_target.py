@@ -4,13 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+from filters.plain import Plain
 
-from track_fusion.filters import cubature
+from track_fusion.filters.cubature import Cubature
 from track_fusion.rules import RULES, SourceTracks
 from track_fusion.scenarios import RuleChoice
 from track_fusion.scenarios.li2022 import linear as li2022_linear
 from track_fusion.scenarios.li2022 import nonlinear as li2022_nonlinear
-from track_fusion.study.one_target import Draws, drawn
+from track_fusion.study.one_target import drawn
 
 RUNS = 100
 #: sd of one 100-run table, position, from 500 runs of our own times sqrt(5).
@@ -82,10 +83,10 @@ def test_particle_rows_of_table_1():
 @pytest.mark.parametrize("module", [li2022_linear, li2022_nonlinear])
 def test_rows_do_not_depend_on_the_batch(module):
     short = dataclasses.replace(module.TRACKING, steps=5)
-    _, draws = drawn(short, range(3), 0)
+    draws = drawn(short, range(3), 0)
     for name, row in module.STUDY.rows.items():
         together = [fused for _, fused in zip(range(5), row.estimates(draws), strict=False)]
-        alone = row.estimates(Draws(0, range(1, 2), [z[1:2] for z in draws.seen]))
+        alone = row.estimates(draws.part(slice(1, 2)))
         for whole, one in zip(together, alone, strict=False):
             np.testing.assert_allclose(one.mean[0], whole.mean[1], rtol=1e-9, err_msg=name)
             np.testing.assert_allclose(one.cov[-1], whole.cov[-1 if len(whole.cov) == 1 else 1], rtol=1e-7, atol=1e-9)
@@ -105,14 +106,12 @@ def test_cubature_filters_under_rules_that_the_user_names():
     tracking, rule = li2022_nonlinear.TRACKING, RULES["mhdp_explicit"]
     choice = RuleChoice("mhdp_explicit", rule.params(), "mine")
     found = li2022_nonlinear.SCENARIO.compare([choice], [3], 1, lambda share: None)
-    truth, draws = drawn(tracking, [3], 1)
+    _, _, truth, seen = drawn(tracking, [3], 1)
+    one = Plain(Cubature())
     mean, cov, squares = tracking.initial_mean, tracking.initial_cov, []
     for k in range(tracking.steps):
-        mean, cov = cubature.predict(mean, cov, tracking.motion.over(tracking.dt_s))
-        local = [
-            cubature.update(mean, cov, z[0, k], s)[:2]
-            for z, s in zip(draws.seen, tracking.sensors.values(), strict=True)
-        ]
+        mean, cov = one.predict(mean, cov, tracking.motion.over(tracking.dt_s))
+        local = [one.update(mean, cov, z[0, k], s)[:2] for z, s in zip(seen, tracking.sensors.values(), strict=True)]
         fused = rule(SourceTracks(np.stack([m for m, _ in local]), np.stack([c for _, c in local])))
         mean, cov = fused.mean, fused.cov
         squares.append((mean - truth[0, k + 1]) ** 2)

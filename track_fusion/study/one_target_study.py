@@ -12,7 +12,7 @@ from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate, armse, rmse
 from track_fusion.rules import FusedTracks
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.one_target import Draws, Row, drawn
+from track_fusion.study.one_target import Row, drawn
 from track_fusion.study.rows import Outcomes, Progress, chosen
 from track_fusion.study.rule_choice import RuleChoice, check_needs
 from track_fusion.study.scene import Tracking
@@ -80,19 +80,18 @@ class OneTargetStudy:
         return self._run(chosen(self.rows, only), runs, seed, progress)
 
     def _run(self, rows: Mapping[str, Row], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
-        truth, draws = drawn(self.tracking, runs, seed)
-        found: Outcomes = {TRUTH: np.ascontiguousarray(truth[..., self.quantities[0].axes])}
+        draws = drawn(self.tracking, runs, seed)
+        outcomes: Outcomes = {TRUTH: np.ascontiguousarray(draws.truth[..., self.quantities[0].axes])}
         for done, (name, row) in enumerate(rows.items()):
             kept, step = self._empty(name, len(runs)), row.chunk or len(runs)
-            found |= {f"{name}/{key}": array for key, array in kept.items()}
+            outcomes |= {f"{name}/{key}": array for key, array in kept.items()}
             for begin in range(0, len(runs), step):
                 part = slice(begin, min(begin + step, len(runs)))
-                piece = Draws(seed, runs[part], [z[part] for z in draws.seen])
-                for k, fused in enumerate(row.estimates(piece)):
-                    self._keep({key: a[part, k] for key, a in kept.items()}, fused, truth[part, k + 1])
+                for k, fused in enumerate(row.estimates(draws.part(part))):
+                    self._keep({key: a[part, k] for key, a in kept.items()}, fused, draws.truth[part, k + 1])
                     share = (begin + (part.stop - begin) * (k + 1) / self.tracking.steps) / len(runs)
                     progress((done + share) / len(rows))
-        return found
+        return outcomes
 
     def _empty(self, row: str, runs: int) -> Outcomes:
         shapes = {q.error: (len(q.axes),) for q in self.quantities} | {CLAIMED: ()}
@@ -119,10 +118,10 @@ class OneTargetStudy:
         """
         check_needs(rules)
         name, row = self.compared
-        found = self._run({f"{name}-{choice.name}": row(choice) for choice in rules}, runs, seed, progress)
+        outcomes = self._run({f"{name}-{choice.name}": row(choice) for choice in rules}, runs, seed, progress)
         return {
             f"{name}-{choice.name}/{q.name}_rmse_{q.unit}": np.sqrt(
-                _squares(found[f"{name}-{choice.name}/{q.error}"]).mean(1)
+                _squares(outcomes[f"{name}-{choice.name}/{q.error}"]).mean(1)
             )
             for choice in rules
             for q in self.quantities
@@ -135,16 +134,16 @@ class OneTargetStudy:
         is the claimed variance over the squared error, each averaged over runs and steps: 1 = the truth, below =
         overconfident.
         """
-        found: dict[str, Estimate] = {}
+        estimates: dict[str, Estimate] = {}
         for row in _rows(outcomes):
             for q in self.quantities:
-                found[f"{row}/{q.armse}"] = armse(_squares(outcomes[f"{row}/{q.error}"]))
+                estimates[f"{row}/{q.armse}"] = armse(_squares(outcomes[f"{row}/{q.error}"]))
             claimed, squares = outcomes[f"{row}/{CLAIMED}"], self._position_squares(outcomes, row)
-            found[f"{row}/position_claimed_m"] = armse(claimed)
-            found[f"{row}/position_credibility_1"] = Estimate.ratio(claimed.mean(1), squares.mean(1))
+            estimates[f"{row}/position_claimed_m"] = armse(claimed)
+            estimates[f"{row}/position_credibility_1"] = Estimate.ratio(claimed.mean(1), squares.mean(1))
             if f"{row}/{WEIGHT}" in outcomes:
-                found |= _weight_figures(row, outcomes[f"{row}/{WEIGHT}"])
-        return found
+                estimates |= _weight_figures(row, outcomes[f"{row}/{WEIGHT}"])
+        return estimates
 
     def _position_squares(self, outcomes: Outcomes, row: str) -> Array:
         return _squares(outcomes[f"{row}/{self.quantities[0].error}"])
@@ -155,11 +154,11 @@ class OneTargetStudy:
         for row in _rows(outcomes):
             if _rule(row) not in NOT_DRAWN:
                 filters.setdefault(row.partition("-")[0], []).append(row)
-        found = [self._course(name, rows, outcomes) for name, rows in filters.items()]
-        found += [self._errors(name, q, rows, outcomes) for q in self.quantities for name, rows in filters.items()]
-        found += [self._credibility(name, rows, outcomes) for name, rows in filters.items()]
+        charts = [self._course(name, rows, outcomes) for name, rows in filters.items()]
+        charts += [self._errors(name, q, rows, outcomes) for q in self.quantities for name, rows in filters.items()]
+        charts += [self._credibility(name, rows, outcomes) for name, rows in filters.items()]
         averages = [row for row in _rows(outcomes) if _rule(row) == "arithmetic_average"]
-        return found + ([_weights(averages, outcomes)] if averages else [])
+        return charts + ([_weights(averages, outcomes)] if averages else [])
 
     def _course(self, name: str, rows: Iterable[str], outcomes: Outcomes) -> Chart:
         """Draw the first run's course by the paper's own rows."""

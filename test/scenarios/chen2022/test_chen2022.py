@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from track_fusion.filters.gaussian_student_t_mixture import GaussianStudentTMixture, MixtureNoiseParams
 from track_fusion.linalg import Array
 from track_fusion.models.noise import Noise
 from track_fusion.params import ParameterError
+from track_fusion.random_streams import stream
 from track_fusion.rules import RULES, SourceTracks
 from track_fusion.rules.split_covariance_intersection import SplitCovarianceIntersectionParams
 from track_fusion.scenarios import SCENARIOS, RuleChoice, judged_claims
@@ -121,7 +123,7 @@ def test_noise_is_drawn_step_by_step_and_by_role() -> None:
     for other in (noise.draw(1, 2, "sensor_2", 50, 2), noise.draw(1, 3, "sensor_1", 50, 2)):
         assert not np.isclose(other, long).any()
     # By itself what the filters are told: as before there was any other.
-    np.testing.assert_array_equal(Noise().draw(1, 2, "a", 5, 2), dynamic.stream(1, 2, "a").standard_normal((5, 2)))
+    np.testing.assert_array_equal(Noise().draw(1, 2, "a", 5, 2), stream(1, 2, "a").standard_normal((5, 2)))
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -192,13 +194,11 @@ def test_student_rows_equal_the_papers_recursion_in_scatters(case: str, choice: 
     np.testing.assert_allclose(fused, scatters_fused(SHORT[case], choice, 6, 8), rtol=1e-6, atol=1e-6)
 
 
-def test_mixture_filter_without_outliers_is_the_kalman_filter(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mixture_filter_without_outliers_is_the_kalman_filter() -> None:
     """With the prior count of Student-t noises at nothing its posterior scatter is Kalman's of nominal Q, R and P."""
-    trusting = dynamic.gaussian_student_t_mixture.MixtureNoiseParams(gaussian_count=1e9, student_count=1e-9)
-    update = dynamic.gaussian_student_t_mixture.update
-    monkeypatch.setattr(dynamic.gaussian_student_t_mixture, "update", lambda *args: update(*args, trusting))
+    trusting = GaussianStudentTMixture(MixtureNoiseParams(gaussian_count=1e9, student_count=1e-9), dynamic.DOF)
     mean, cov, sensor = np.array([[1.0, 2.0]]), np.array([[[9.0, 1.0], [1.0, 6.0]]]), dynamic.SENSOR_3
-    found, found_cov, _ = dynamic.mixture_update(mean, cov, np.array([[2.0, 1.0]]), sensor)
+    found, found_cov = trusting.update(trusting.begin(mean, cov), np.array([[2.0, 1.0]]), sensor)[0].moments
     info = np.linalg.inv(cov[0] / 3.0) + np.linalg.inv(np.array(R_3))
     np.testing.assert_allclose(found_cov[0], 3.0 * np.linalg.inv(info), rtol=1e-6)
     wanted = np.linalg.solve(info, np.linalg.solve(cov[0] / 3.0, mean[0]) + np.linalg.solve(R_3, [2.0, 1.0]))

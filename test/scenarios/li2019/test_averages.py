@@ -11,8 +11,8 @@ from scipy.integrate import dblquad
 from scipy.optimize import minimize_scalar
 from scipy.stats import multivariate_normal
 
-from track_fusion.densities.gaussian import merge, weighted_product
-from track_fusion.linalg import Array
+from track_fusion.densities.gaussian import weighted_product
+from track_fusion.linalg import Array, merged_moments
 from track_fusion.scenarios.li2019.averages import (
     arithmetic_average,
     arithmetic_moments,
@@ -76,7 +76,7 @@ def test_figures_5_and_6_averages_of_densities(variances: tuple[float, float], a
     cov, half = np.array(variances)[:, None, None], np.array([0.5, 0.5])
     nodes, width = np.linspace(-150.0, 260.0, 40_001), np.full(40_001, 410.0 / 40_000)
     densities = np.stack([multivariate_normal(m, v).pdf(nodes) for m, v in zip(MEAN, variances, strict=True)])
-    for geometric, kernel, wanted in ((False, merge, aa), (True, weighted_product, ga)):
+    for geometric, kernel, wanted in ((False, merged_moments, aa), (True, weighted_product, ga)):
         mean, fused = kernel(MEAN[:, None], cov, half)
         assert fused[0, 0] == pytest.approx(wanted, abs=0.005)
         density = density_average(densities, width, half, geometric)

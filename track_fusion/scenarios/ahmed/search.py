@@ -13,7 +13,7 @@ from track_fusion.densities.log_domain import normalised
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.densities.mixture.reduction import prune, runnalls
 from track_fusion.densities.on_grid import grid, kl_on_grid
-from track_fusion.filters import negative_information
+from track_fusion.filters.negative_information import NegativeInformation
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.models.detection import SoftmaxDetector
@@ -49,7 +49,7 @@ HUB = "3"
 LINKS = star(HUB, [name for name in ROBOTS if name != HUB])
 NO_DETECTION = np.array([0.0, 1.0, 1.0, 1.0])
 #: Points for the moments of a component cut by a view cone, and below which relative variation it is not cut.
-FILTER_SAMPLES, UNCUT = 256, 0.1
+FILTER = NegativeInformation(samples=256, negligible=0.1)
 #: Components below this share are dropped before Runnalls' merging.
 NEGLIGIBLE = 1e-9
 
@@ -97,9 +97,7 @@ def searched(start: Mixture, robots: Iterable[str]) -> Mixture:
     robots, mixture = tuple(robots), start
     for step in range(1, STEPS + 1):
         for robot in robots:
-            mixture, _ = negative_information.update(
-                mixture, cone(robot, step), NO_DETECTION, FILTER_SAMPLES, negligible=UNCUT
-            )
+            mixture, _ = FILTER.update(mixture, NO_DETECTION, cone(robot, step))
             mixture = runnalls(prune(mixture, NEGLIGIBLE)[0], COMPONENTS)
     return mixture
 

@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from track_fusion.densities.gaussian import merge, weighted_product
-from track_fusion.linalg import Array
+from track_fusion.densities.gaussian import weighted_product
+from track_fusion.linalg import Array, merged_moments
 from track_fusion.rules import SourceTracks
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.rules.geometric_average import GeometricAverageParams
@@ -48,7 +48,7 @@ class Pair:
         weights, tracks = np.stack([weight, 1.0 - weight], -1), self.tracks
         mean = np.broadcast_to(tracks.mean, (len(weight), 2, 1))
         cov = np.broadcast_to(tracks.cov, (len(weight), 2, 1, 1))
-        fused_mean, fused_cov = (merge if average == AA else weighted_product)(mean, cov, weights)
+        fused_mean, fused_cov = (merged_moments if average == AA else weighted_product)(mean, cov, weights)
         return fused_mean[:, 0], fused_cov[:, 0, 0]
 
     def errors(self, average: str, weight: Array, theta: Array) -> Array:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from track_fusion.filters import cubature
+from track_fusion.filters.cubature import Cubature
+from track_fusion.filters.particle import SirParams
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
 from track_fusion.scenarios.li2022 import PAPER
@@ -20,15 +21,7 @@ from track_fusion.scenarios.li2022.claims import (
     union_claims,
     weight_claims,
 )
-from track_fusion.study.one_target import (
-    RULE_CHOICES,
-    GaussianFilter,
-    Row,
-    Sir,
-    gaussian_alone,
-    gaussian_fused,
-    sir_rows,
-)
+from track_fusion.study.one_target import RULE_CHOICES, Row, alone_row, fused_row, same_filters, sir_rows
 from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
 from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.study.scenario import Claim, Printed, Scenario
@@ -61,8 +54,7 @@ QUANTITIES = (
     Quantity("velocity", "mps", LAYOUT.velocity),
     Quantity("turn_rate", "degps", (4,), float(np.degrees(1.0))),
 )
-CKF = GaussianFilter(cubature.predict, cubature.update)
-SIR = Sir(500)
+CKF, SIR = same_filters(Cubature()), SirParams(particles=500)
 
 TRACKING = Tracking(
     motion=CoordinatedTurn(LAYOUT, CoordinatedTurnParams(process_noise=0.1, turn_rate_noise=1e-4)),
@@ -79,12 +71,12 @@ TRACKING = Tracking(
 
 def cubature_row(choice: RuleChoice) -> Row:
     """Two cubature Kalman filters fused by any rule."""
-    return gaussian_fused(TRACKING, CKF, choice)
+    return fused_row(TRACKING, CKF, choice)
 
 
 def cubature_rows() -> dict[str, Row]:
     """Rows of Table II by cubature Kalman filters."""
-    table = {"ckf-alone": gaussian_alone(TRACKING, CKF, 1), "ckf-ic": gaussian_alone(TRACKING, CKF, 2)}
+    table = {"ckf-alone": alone_row(TRACKING, CKF, 1), "ckf-ic": alone_row(TRACKING, CKF, 2)}
     return table | {f"ckf-{choice.name}": cubature_row(choice) for choice in RULE_CHOICES}
 
 
@@ -105,7 +97,7 @@ LOST = 3.0
 def _claims() -> tuple[Claim, ...]:
     first, last = named("sensor_1_weight_first_1", "ckf", AVERAGE), named("sensor_1_weight_last_1", "ckf", AVERAGE)
     but_ic = ("alone", "naive", AVERAGE, INTERSECTION, UNION)
-    found = [
+    claims = [
         Claim.order(
             "SIR with both sensors' measurements (IC) is worse than CKF-IC, and even than SIR with covariance union",
             "IV-B",
@@ -125,13 +117,13 @@ def _claims() -> tuple[Claim, ...]:
     ]
     for rule in (AVERAGE, INTERSECTION):
         names = [f"{one}-{rule}/{POSITION}" for one in ("ckf", "sir")]
-        found.append(
+        claims.append(
             close(f"particles do not degenerate under {rule}: SIR is within 8 % of CKF", "IV-B", CLOSE, *names)
         )
     for one in ("ckf", "sir"):
         name, naive = one.upper(), f"{one}-naive/{POSITION}"
         best = named(POSITION, one, AVERAGE, INTERSECTION)
-        found += [
+        claims += [
             Claim.greatest(
                 f"{name} with naive fusion loses the target: three times the error of every other row",
                 "IV-B, Fig. 7",
@@ -162,7 +154,7 @@ def _claims() -> tuple[Claim, ...]:
             *union_claims(one, "IV-B"),
             *balance_claims(one, "IV-B"),
         ]
-    return tuple(found)
+    return tuple(claims)
 
 
 SCENARIO = Scenario(

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from track_fusion.filters.base import Gaussian
 from track_fusion.linalg import Array, outer
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.metrics.consistency import nees
@@ -37,19 +38,15 @@ TRACE_WEIGHTS = (
 )
 
 
-class Tracks(NamedTuple):
-    """One node's estimate in R runs: mean (R, n), cov (R, n, n), or (1, n, n) where all runs have the same."""
-
-    mean: Array
-    cov: Array
-
-
 class Local(NamedTuple):
-    """R runs before anything is sent: state (R, n), estimate of each node, and of one filter that saw all."""
+    """R runs before anything is sent: state (R, n), estimate of each node, and of one filter that saw all.
+
+    Estimates have mean (R, n), cov (R, n, n), or (1, n, n) where all runs have the same.
+    """
 
     state: Array
-    nodes: Mapping[str, Tracks]
-    centralised: Tracks
+    nodes: Mapping[str, Gaussian]
+    centralised: Gaussian
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,20 +64,20 @@ class Network:
     rounds: tuple[Round, ...]
     sink: str
 
-    def fused(self, local: Local, choice: RuleChoice, rngs: Sequence[np.random.Generator] | None = None) -> Tracks:
+    def fused(self, local: Local, choice: RuleChoice, rngs: Sequence[np.random.Generator] | None = None) -> Gaussian:
         """Send estimates through the network, fused by a rule; return the sink's.
 
         A rule that samples draws from each run's generator in `rngs`.
         """
 
-        def fuse(own: Tracks, heard: Tracks, common: Tracks | None, count: int) -> Tracks:
+        def fuse(own: Gaussian, heard: Gaussian, common: Gaussian | None, count: int) -> Gaussian:
             size = max(len(own.cov), len(heard.cov))
             covs = [np.broadcast_to(t.cov, (size, *t.cov.shape[1:])) for t in (own, heard)]
             means = np.stack([own.mean, heard.mean], 1)
             fused = fuse_runs(choice, means, np.stack(covs, 1), rngs)
-            return Tracks(fused.mean, fused.cov)
+            return Gaussian(fused.mean, fused.cov)
 
-        peers = {name: Peer(tracks) for name, tracks in local.nodes.items()}
+        peers = {name: Peer(estimate) for name, estimate in local.nodes.items()}
         for sent in self.rounds:
             peers = communicate(peers, sent, fuse)
         return peers[self.sink].density
@@ -111,25 +108,25 @@ def simulate(
     """
     wanted = chosen({row_name(row, reading): (reading, c) for reading in readings for row, c in ROWS.items()}, only)
     local = {reading: readings[reading].estimate(runs, seed) for reading in {r for r, _ in wanted.values()}}
-    found: Outcomes = {}
+    outcomes: Outcomes = {}
     for done, (name, (reading, choice)) in enumerate(wanted.items()):
         start = local[reading]
         fused = start.centralised if choice is None else readings[reading].fused(start, choice)
-        found[f"{name}/error"] = fused.mean - start.state
-        found[f"{name}/cov"] = np.broadcast_to(fused.cov, (len(runs), *fused.cov.shape[1:]))
+        outcomes[f"{name}/error"] = fused.mean - start.state
+        outcomes[f"{name}/cov"] = np.broadcast_to(fused.cov, (len(runs), *fused.cov.shape[1:]))
         progress((done + 1) / len(wanted))
-    return found
+    return outcomes
 
 
 def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Trace of the covariance reported and of the errors' own, and NEES over the number of axes."""
-    found = {}
+    estimates = {}
     for name in _rows(outcomes):
         error, cov = outcomes[f"{name}/error"], outcomes[f"{name}/cov"]
-        found[f"{name}/reported_trace_1"] = Estimate.mean(np.trace(cov, axis1=1, axis2=2))
-        found[f"{name}/sample_trace_1"] = Estimate.mean((error**2).sum(1))
-        found[f"{name}/nees_1"] = Estimate.mean(nees(error, cov) / error.shape[1])
-    return found
+        estimates[f"{name}/reported_trace_1"] = Estimate.mean(np.trace(cov, axis1=1, axis2=2))
+        estimates[f"{name}/sample_trace_1"] = Estimate.mean((error**2).sum(1))
+        estimates[f"{name}/nees_1"] = Estimate.mean(nees(error, cov) / error.shape[1])
+    return estimates
 
 
 def _rows(outcomes: Outcomes) -> list[str]:
@@ -143,12 +140,12 @@ def charts(readings: Mapping[str, str], outcomes: Outcomes) -> list[Chart]:
     ----------
     readings : reading -> what to call it in titles
     """
-    found = []
+    panels = []
     for reading, title in readings.items():
         for labels in PICTURES:
             lines = [line for row in labels for line in _ellipses(outcomes, row, reading, labels[row])]
             if lines:
-                found.append(Chart(f"{title}, 2 sigma", "x", "y", tuple(lines), equal=True))
+                panels.append(Chart(f"{title}, 2 sigma", "x", "y", tuple(lines), equal=True))
     measured = figures(outcomes)
     bars = {_label(name): measured[f"{name}/nees_1"] for name in _rows(outcomes)}
     place = np.arange(len(bars), dtype=float)
@@ -158,7 +155,7 @@ def charts(readings: Mapping[str, str], outcomes: Outcomes) -> list[Chart]:
         Series("consistent", place[[0, -1]], np.ones(2), "dashed"),
     )
     ticks = dict(zip(place.tolist(), bars, strict=True))
-    return [*found, Chart("Squared errors over the covariance reported", "", "NEES / n", series, ticks=ticks)]
+    return [*panels, Chart("Squared errors over the covariance reported", "", "NEES / n", series, ticks=ticks)]
 
 
 def _label(name: str) -> str:

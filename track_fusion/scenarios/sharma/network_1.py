@@ -7,14 +7,17 @@ from functools import partial
 
 import numpy as np
 
-from track_fusion.filters.kalman import update, update_joint
+from track_fusion.filters.base import Gaussian
+from track_fusion.filters.iterated_corrector import IteratedCorrector
+from track_fusion.filters.kalman import Kalman
 from track_fusion.linalg import Array, matvec
 from track_fusion.metrics.accuracy import Estimate
+from track_fusion.models.measurement import LinearSensor
 from track_fusion.peers import Round
 from track_fusion.random_streams import stream
 from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import network as shared
-from track_fusion.scenarios.sharma.network import RULE_CHOICES, Local, Network, Tracks, common_claims
+from track_fusion.scenarios.sharma.network import RULE_CHOICES, Local, Network, common_claims
 from track_fusion.study.chart import Chart
 from track_fusion.study.rows import Outcomes, Progress
 from track_fusion.study.scenario import Claim, Scenario
@@ -43,14 +46,16 @@ def estimate(components: int, runs: Sequence[int], seed: int) -> Local:
     """Draw the state, and let every node take in its own measurement of so many components."""
     draws = np.stack([stream(seed, run, "network").standard_normal((1 + NODES, 2)) for run in runs])
     state = MEAN + np.sqrt(VARIANCE) * draws[:, 0]
-    mean, cov = np.broadcast_to(MEAN, state.shape), VARIANCE * np.eye(2)[None]
-    matrices, noise = [matrix(i, components) for i in range(1, NODES + 1)], NOISE * np.eye(components)
-    zs = [matvec(h, state) + np.sqrt(NOISE) * draws[:, i + 1, :components] for i, h in enumerate(matrices)]
-    nodes = {
-        f"S{i + 1}": Tracks(*update(mean, cov, z, h, noise)[:2])
-        for i, (z, h) in enumerate(zip(zs, matrices, strict=True))
+    axes, noise = ("first", "second")[:components], NOISE * np.eye(components)
+    sensors = {f"S{i}": LinearSensor(axes, matrix(i, components), noise) for i in range(1, NODES + 1)}
+    zs = {
+        name: matvec(sensor.matrix, state) + np.sqrt(NOISE) * draws[:, i, :components]
+        for i, (name, sensor) in enumerate(sensors.items(), 1)
     }
-    return Local(state, nodes, Tracks(*update_joint(mean, cov, zs, matrices, [noise] * NODES)[:2]))
+    prior, one = Gaussian(np.broadcast_to(MEAN, state.shape), VARIANCE * np.eye(2)[None]), Kalman()
+    nodes = {name: one.update(prior, zs[name], sensor)[0] for name, sensor in sensors.items()}
+    centralised, _ = IteratedCorrector(one).update(prior, list(zs.values()), list(sensors.values()))
+    return Local(state, nodes, centralised)
 
 
 READINGS = {
