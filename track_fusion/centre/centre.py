@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
@@ -56,7 +55,7 @@ class FusionCentre:
     def step(self, time_ns: int, scans: Mapping[int, TrackBatch]) -> tuple[TrackBatch, StepInfo]:
         """Fuse at one time; see :func:`track_fusion.centre.step.step`."""
         self.state, published, info = step(self.config, self.state, time_ns, scans)
-        self.buffer = dataclasses.replace(self.buffer, fused_ns=time_ns)
+        self.buffer = ScanBuffer(self.buffer.queues, time_ns)
         return published, info
 
     def receive(self, source: int, scan: TrackBatch, stamp_ns: int, now_ns: int) -> str | None:
