@@ -105,7 +105,11 @@ def _fuse_pairs(mean: Array, cov: Array, criterion: str) -> Fusion:
     if delicate.any():
         rows = np.flatnonzero(delicate)
         fused_mean[rows], fused_cov[rows], exact = _fuse_delicate(mean[rows], cov[rows], criterion)
-        weights[rows], search.converged[rows], search.iterations[rows] = exact.weights, exact.converged, exact.iterations
+        weights[rows], search.converged[rows], search.iterations[rows] = (
+            exact.weights,
+            exact.converged,
+            exact.iterations,
+        )
     return fused_mean, fused_cov, Solution(weights, search.converged, search.iterations)
 
 
