@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parent.parent
 # Domains up to 101 keep Fast DDS's ports below the range from which Linux hands out ephemeral ones; 0 is the users'.
 DOMAINS = range(1, 102)
 # What is tested in these folders no version of NumPy or SciPy changes: texts, processes, packaging.
-ONCE = frozenset({"bags", "cli", "nodes", "package", "plugins", "tools"})
+ONCE = frozenset({"bags", "cli", "nodes", "package", "tools"})
 
 # How long an example takes tells of the machine's other work only.
 hypothesis.settings.register_profile("unhurried", deadline=None)
