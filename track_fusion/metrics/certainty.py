@@ -44,9 +44,9 @@ def surely_positive(values: Array, tail: float = TAIL) -> bool:
     limit = float(stdtrit(runs - 1, 1.0 - tail)) * np.sqrt(variance / runs)
     third = float((deviation**3).sum()) * runs / ((runs - 1) * (runs - 2))
     if mean <= limit or abs(third) <= SKEWED * np.sqrt(runs * variance**3):
-        return mean > limit
+        return bool(mean > limit)
     correction = third / variance * (1.0 / (6.0 * runs) + mean**2 / (3.0 * variance))
-    return rank_sigmas(values) > RANK_SIGMAS and mean + min(correction, 0.0) > limit
+    return bool(rank_sigmas(values) > RANK_SIGMAS and mean + min(correction, 0.0) > limit)
 
 
 def rank_sigmas(values: Array) -> float:

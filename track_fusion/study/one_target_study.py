@@ -14,7 +14,7 @@ from track_fusion.rules import FusedTracks
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.one_target import Row, drawn
 from track_fusion.study.rows import Outcomes, Progress, chosen
-from track_fusion.study.rule_choice import RuleChoice, check_needs
+from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.study.scene import Tracking
 
 TRUTH = "truth/position_m"
@@ -109,16 +109,11 @@ class OneTargetStudy:
             assert fused.weights is not None
             into[WEIGHT][...] = fused.weights[:, 0]
 
-    def compare(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
+    def scores(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
         """Errors of each run, (R,), under rules of any family, with feedback: root of the time-averaged square.
 
         Of the position also consistency: the squared error over its claim, each averaged over time.
-
-        Raises
-        ------
-        ParameterError    a rule needs more than the tracks
         """
-        check_needs(rules)
         name, row = self.compared
         rows = {f"{name}-{choice.name}": row(choice) for choice in rules}
         outcomes, scores = self._run(rows, runs, seed, progress), {}

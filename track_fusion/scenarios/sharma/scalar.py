@@ -19,7 +19,7 @@ from track_fusion.scenarios.sharma import PAPER
 from track_fusion.study.chart import Chart, Series, bars
 from track_fusion.study.claim import Claim, within
 from track_fusion.study.rows import Outcomes, Progress, chosen, row_by_row
-from track_fusion.study.rule_choice import RuleChoice, compare_each, fuse_runs
+from track_fusion.study.rule_choice import RuleChoice, fuse_runs, rule_by_rule
 from track_fusion.study.scenario import Scenario
 
 STEPS = 100
@@ -210,25 +210,20 @@ def _bars(outcomes: Outcomes) -> list[Chart]:
     return [bars("HMD-GA: squared error over the claimed variance", "NEES", values, "consistent")] if values else []
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
-    """Run any rules in every setting: root of the squared error averaged over the steps, and NEES likewise, (R,).
-
-    Raises
-    ------
-    ParameterError    a rule needs more than the two tracks
-    """
+def scores(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
+    """Run any rules in every setting: root of the squared error averaged over the steps, and NEES likewise, (R,)."""
     normals = _normals(runs, seed)
 
     def measure(choice: RuleChoice) -> Outcomes:
-        scores = {}
+        of_run = {}
         for setting in SETTINGS:
             rngs = [stream(seed, run, "rule") for run in runs]
             tracked = track(setting, choice, normals, rngs)
-            scores[f"rmse_{setting.name}_1"] = np.sqrt(tracked.square.mean(1))
-            scores[f"consistency_{setting.name}_1"] = tracked.nees.mean(1)
-        return scores
+            of_run[f"rmse_{setting.name}_1"] = np.sqrt(tracked.square.mean(1))
+            of_run[f"consistency_{setting.name}_1"] = tracked.nees.mean(1)
+        return of_run
 
-    return compare_each("kf", rules, progress, measure)
+    return rule_by_rule("kf", rules, progress, measure)
 
 
 def _names(row: str, quantity: str) -> tuple[str, ...]:
@@ -306,5 +301,5 @@ SCENARIO = Scenario(
     claims=CLAIMS,
     piece=50,
     rules=RULE_CHOICES,
-    compare=compare,
+    scores=scores,
 )
