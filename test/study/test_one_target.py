@@ -115,7 +115,7 @@ def test_cubature_filters_under_rules_that_the_user_names():
         fused = rule(SourceTracks(np.stack([m for m, _ in local]), np.stack([c for _, c in local])))
         mean, cov = fused.mean, fused.cov
         squares.append((mean - truth[0, k + 1]) ** 2)
-        claimed.append(cov[[0, 2], [0, 2]].sum())
+        claimed.append(cov[[0, 1], [0, 1]].sum())
     position, velocity, turn = np.sqrt(
         np.mean(squares, 0) @ np.array([[1, 1, 0, 0, 0], [0, 0, 1, 1, 0], [0] * 4 + [1]]).T
     )
