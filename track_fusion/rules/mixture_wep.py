@@ -13,17 +13,11 @@ from numpy.typing import NDArray
 from track_fusion.densities.gaussian import weighted_product
 from track_fusion.densities.log_domain import log_of, log_sum_exp, normalised
 from track_fusion.densities.mixture.algebra import LogMixture, first_order, product
+from track_fusion.densities.mixture.exponent import PROPOSAL_OMEGA, Omega, optimise_omega, overlap_proposal
 from track_fusion.densities.mixture.mixture import Mixture, chosen, same, stacked
 from track_fusion.densities.mixture.proposals import prune_mixands
 from track_fusion.densities.mixture.quotient import Laplace, laplace, wep_bound, wep_quotient
-from track_fusion.densities.mixture.sampling import (
-    PROPOSAL_OMEGA,
-    Omega,
-    optimise_omega,
-    overlap_proposal,
-    single_shot_em,
-    weighted_em,
-)
+from track_fusion.densities.mixture.sampling import single_shot_em, weighted_em
 from track_fusion.linalg import Array
 from track_fusion.params import param
 from track_fusion.rules import covariance_intersection

@@ -10,6 +10,7 @@ from scipy import integrate
 from scipy.optimize import minimize_scalar
 
 from track_fusion.densities.mixture.divergence import grid, kl_on_grid, moments_on_grid
+from track_fusion.densities.mixture.exponent import optimise_omega
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments, sample
 from track_fusion.densities.mixture.proposals import (
     Proposal,
@@ -25,7 +26,6 @@ from track_fusion.densities.mixture.quotient import exact_bound, exact_quotient,
 from track_fusion.densities.mixture.sampling import (
     Weighted,
     floored,
-    optimise_omega,
     single_shot_em,
     weighted_em,
 )
