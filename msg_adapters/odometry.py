@@ -19,6 +19,7 @@ from nav_msgs.msg import Odometry
 
 from msg_adapters.arrays import Floats, MessageError, TrackArrays, TrackLike, merged
 from msg_adapters.header import make_header, stamp_to_ns
+from msg_adapters.types import CrossBlock
 
 #: Where an axis stands in the message: 0 to 5 the pose, 6 to 11 the twist.
 _SLOT = {"x": 0, "y": 1, "z": 2, "yaw": 5, "vx": 6, "vy": 7, "vz": 8, "turn_rate": 11}
@@ -32,8 +33,6 @@ QUATERNION_TOLERANCE = 1e-2
 #: "42", "track_42", "robot_1/track_42", "track42"; but not the last digits of a hexadecimal name.
 _NUMBERED = re.compile(r"(?:.*[_/#:.\-])?[A-Za-z]*?([0-9]+)", re.ASCII | re.DOTALL)
 _MAX_ID = 2**32 - 1
-
-CrossBlock = Literal["block_diagonal", "conservative"]
 
 
 class OdometryReading(NamedTuple):

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import textwrap
@@ -14,7 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from track_fusion.params import Params, specs
+from track_fusion.params import Params, Spec, specs
+from track_fusion.plugins import Registry
 
 if TYPE_CHECKING:
     from track_fusion.models.choices import Choice
@@ -95,7 +97,7 @@ def choosing_page() -> str:
     """Return doc/choosing-a-rule.md, written by hand but for its table of promises."""
     from track_fusion.rules import RULES
 
-    rows = [(f"[`{r.key}`](rules.md#{r.key})", r.guarantee, r.caveat, r.cost, r.source) for r in RULES.values()]
+    rows = [(f"[`{r.key}`](rules.md#{r.key})", r.guarantee, r.caveat, r.cost, r.source) for r in RULES.own.values()]
     table = _table(("rule", "promise", "when, or what breaks it", "cost", "source"), rows)
     text = (SOURCE_TREE / "doc" / "choosing-a-rule.md").read_text(encoding="utf-8")
     return _TABLE.sub(lambda found: f"{found[1]}{table}\n{found[2]}", text)
@@ -106,7 +108,7 @@ def rules_page() -> str:
     from track_fusion.cli.rules import describe
     from track_fusion.rules import RULES
 
-    described = [describe(rule) for rule in RULES.values()]
+    described = [describe(rule) for rule in RULES.own.values()]
     columns = ("rule", "family", "tracks", "guarantee", "source", "cost")
     rows = [(f"[`{r['key']}`](#{r['key']})", r["family"], r["arity"], r["guarantee"], r["source"], r["cost"])
             for r in described]  # fmt: skip
@@ -186,9 +188,7 @@ def _table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 def fusion_centre_sections() -> list[Section]:
     """List what the fusion centre declares; a test compares it with the node."""
-    from track_fusion.centre.centre import FusionCentreParams
-    from track_fusion.centre.scan_buffer import ScanBufferParams
-    from track_fusion.centre.track_manager import TrackManagerParams
+    from track_fusion.centre.config import FusionCentreParams, RuleParams, ScanBufferParams, TrackManagerParams
     from track_fusion.models.choices import MOTIONS, MotionChoice
     from track_fusion.nodes.fusion_centre import SourceParams
     from track_fusion.nodes.managed import ManagedParams
@@ -199,9 +199,9 @@ def fusion_centre_sections() -> list[Section]:
     used = "read when state_fusion is"
     return [
         *map(Section, (FrameParams, SourceParams, MotionChoice)),
-        *_alternatives("motion", MOTIONS, MotionChoice().motion),
-        Section(FusionCentreParams),
-        *(Section(r.params, f"{key}.", f"{r.title}: {used} {key}.") for key, r in RULES.items() if specs(r.params)),
+        *_alternatives("motion", MOTIONS.own, MotionChoice().motion),
+        *map(Section, (RuleParams, FusionCentreParams)),
+        *(Section(r.params, f"{key}.", f"{r.title}: {used} {key}.") for key, r in RULES.own.items() if specs(r.params)),
         *map(Section, (ScanBufferParams, TrackManagerParams)),
         Section(RandomParams, title="Random numbers of rules that draw samples: seed, run and role name a stream."),
         Section(ManagedParams),
@@ -222,7 +222,7 @@ def sensor_tracker_sections() -> list[Section]:
     filters: dict[str, Choice[Any]] = {**TRACK_FILTERS, MULTI_TARGET: Choice(PdaTrackerParams, PdaTracker)}
     return [
         *map(Section, (FrameParams, TrackerChoice)),
-        *_alternatives("motion", MOTIONS, default.motion),
+        *_alternatives("motion", MOTIONS.own, default.motion),
         *_alternatives("sensor", SENSORS, default.sensor),
         *_alternatives("filter", filters, default.filter),
         *map(Section, (SensorTrackerParams, FeedbackParams, OutputParams, ManagedParams)),
@@ -253,12 +253,17 @@ def parameter_file(node: str, sections: Iterable[Section]) -> str:
         lines += ["", *_comment([f"--- {section.heading}"], "    ")]
         for name, (spec, default) in specs(section.params).items():
             unit = f" {spec.unit}" if spec.unit else ""
-            lines += _comment([f"{spec.doc} ({spec.wanted()}{',' + unit if unit else ''})"], "    ")
+            lines += _comment([f"{spec.doc} ({_ours(spec).wanted()}{',' + unit if unit else ''})"], "    ")
             # ROS has no list without entries: it stays unset.
             value = yaml_value(default) if default != () else "unset"
             mark = "" if section.declared and default != () else "# "
             lines.append(f"    {mark}{section.prefix}{name}: {value}")
     return "\n".join(lines) + "\n"
+
+
+def _ours(spec: Spec) -> Spec:
+    """Leave out of the choices what other packages on this machine bring."""
+    return dataclasses.replace(spec, choices=spec.choices.own) if isinstance(spec.choices, Registry) else spec
 
 
 def _comment(paragraphs: Iterable[str], indent: str) -> list[str]:

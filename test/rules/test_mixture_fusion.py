@@ -16,7 +16,8 @@ from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments, sa
 from track_fusion.densities.mixture.sampling import Weighted, single_shot_em
 from track_fusion.linalg import Array
 from track_fusion.params import from_dict
-from track_fusion.rules import FusedTracks, SourceTracks, get_rule, mixture_common
+from track_fusion.rules import FusedTracks, SourceTracks, get_rule
+from track_fusion.rules.shared import sampling
 from track_fusion.scenarios.ahmed.mixtures import Problem, divergence, log_fused
 from track_fusion.scenarios.ahmed.random import study_problem
 
@@ -239,7 +240,7 @@ def test_large_batches_are_cut_into_pieces_that_draw_the_same_numbers(
     common = Mixture(part.weight[:, :, 0], part.mean[:, :, 0], part.cov[:, :, 0] + 60 * np.eye(2))
     tracks = dataclasses.replace(as_tracks(part), extras={"common": common})
     whole = run(key, tracks, **values)
-    monkeypatch.setattr(mixture_common, "POINTS", 1)
+    monkeypatch.setattr(sampling, "POINTS", 1)
     generator = np.random.default_rng(0)
     cut = run(key, dataclasses.replace(tracks, extras={"common": common, "seed": generator}), **values)
     np.testing.assert_allclose(cut.mean, whole.mean, rtol=1e-9, atol=1e-9)

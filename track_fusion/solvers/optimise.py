@@ -31,6 +31,11 @@ class Solution:
     iterations: NDArray[np.intp]
 
     @staticmethod
+    def known(weights: Array) -> Solution:
+        """Take weights of a batch, (B,) or (B, K), for which nothing is sought."""
+        return Solution(weights, np.ones(len(weights), bool), np.zeros(len(weights), np.intp))
+
+    @staticmethod
     def concatenate(parts: Sequence[Solution]) -> Solution:
         """Join the solutions of the pieces of a batch."""
         columns = [[getattr(p, f.name) for p in parts] for f in dataclasses.fields(Solution)]

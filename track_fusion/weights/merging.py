@@ -39,7 +39,7 @@ def merging_weights(mean: Array, cov: Array, linear: Array | None = None) -> Sol
     Solution    weights (B, K); uniform where all tracks are equal
     """
     if mean.shape[1] == 1:
-        return Solution(np.ones(mean.shape[:2]), np.ones(len(mean), bool), np.zeros(len(mean), np.intp))
+        return Solution.known(np.ones(mean.shape[:2]))
     if mean.shape[1] > 2:
         return minimise_on_simplex(_gradient_hessian(mean, cov, linear), len(mean), mean.shape[1])
     slope = None if linear is None else linear[:, 0] - linear[:, 1]

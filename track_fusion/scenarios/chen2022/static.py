@@ -14,12 +14,12 @@ from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.rules import RULES, SourceTracks
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
-from track_fusion.rules.elliptical_tracks import EllipticalParams
 from track_fusion.rules.fast_covariance_intersection import FastCovarianceIntersectionParams
 from track_fusion.rules.geodesic_projection import GeodesicProjectionParams
 from track_fusion.rules.mhdp_explicit import MhdpExplicitParams
 from track_fusion.rules.mhdp_iterative import MhdpIterativeParams
 from track_fusion.rules.quasi_minimal_manhattan import QuasiMinimalManhattanParams
+from track_fusion.rules.shared.elliptical import EllipticalParams
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario, chosen, compare_each
 

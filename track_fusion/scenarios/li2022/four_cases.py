@@ -49,7 +49,7 @@ CHAIN = (
 
 def enough_for_two() -> list[Rule]:
     """Rules that two tracks are enough for, in the order of the registry."""
-    return [rule for rule in RULES.values() if not rule.needed(rule.params())]
+    return [rule for rule in RULES.own.values() if not rule.needed(rule.params())]
 
 
 _NAMED = {choice.key for choice in (*PAPER, *CHAIN)}

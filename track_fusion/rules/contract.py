@@ -1,0 +1,238 @@
+"""The laws that every fusion rule keeps: for our tests, and by `track-fusion rules --check` for a rule of anybody's.
+
+A law returns nothing where a rule keeps it, or the reason for which it does not apply, and raises :class:`BrokenLaw`.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from track_fusion.linalg import Array, symmetrise, transpose
+from track_fusion.params import specs
+from track_fusion.rules.base import EACH, Example, FusedTracks, Mixture, Rule, SourceTracks
+from track_fusion.rules.trials import AXES, BrokenLaw, Case, Rng, arrays_of, linear_estimate, select, worst_error
+
+Law = Callable[[Rule, Example, Rng], str | None]
+
+#: What is claimed to differ must do so by this, in standard deviations.
+DIFFERENT = 1e-3
+#: Of so many draws of tracks, each with many joint error covariances, the worst is held against the claim, and must
+#: reach this share of it, or it shows nothing.
+DRAWS, TELLING = 25, 0.7
+
+
+class Verdict(NamedTuple):
+    """What became of a law: "passed", "failed" or "skipped", and what it says, or why not."""
+
+    law: str
+    outcome: str
+    text: str
+
+
+def check(rule: Rule) -> Iterator[Verdict]:
+    """Hold a rule against each law."""
+    for seed, law in enumerate(LAWS):
+        try:
+            reason = law(rule, rule.example, np.random.default_rng(seed))
+        except BrokenLaw as error:
+            yield Verdict(law.__name__, "failed", str(error))
+        else:
+            yield Verdict(law.__name__, "skipped" if reason else "passed", reason or law.__doc__ or "")
+
+
+def _in_each_case(counts: Sequence[int], values: str = "params") -> Callable[[Callable[[Case, Rng], str | None]], Law]:
+    """Make a law of what holds in a case: for these numbers of sources, at each of the example's `values`.
+
+    Each case draws the same numbers, so that none depends on those before it.
+    """
+
+    def make(holds: Callable[[Case, Rng], str | None]) -> Law:
+        @functools.wraps(holds)
+        def law(rule: Rule, example: Example, rng: Rng) -> str | None:
+            reason = None
+            for case in (Case(rule, example, v, count) for v in getattr(example, values) for count in counts):
+                try:
+                    reason = holds(case, copy.deepcopy(rng)) or reason
+                except Exception as error:  # a rule that fails breaks the law, too
+                    text = str(error) if isinstance(error, BrokenLaw) else f"{type(error).__name__}: {error}"
+                    raise BrokenLaw(f"{case.count} tracks, parameters {dict(case.values)}: {text}") from error
+            return reason
+
+        return law
+
+    return make
+
+
+def _require(good: Any, text: str) -> None:
+    if not good:
+        raise BrokenLaw(text)
+
+
+def _apart(got: FusedTracks, wanted: FusedTracks) -> Array:
+    """Largest difference of the moments, (...), in the wanted standard deviations."""
+    sigma = np.sqrt(np.diagonal(wanted.cov, axis1=-2, axis2=-1))
+    mean = np.abs((got.mean - wanted.mean) / sigma).max(-1, initial=0.0)
+    unit = sigma[..., :, None] * sigma[..., None, :]
+    return np.asarray(np.maximum(mean, np.abs((got.cov - wanted.cov) / unit).max((-2, -1), initial=0.0)))
+
+
+def _same(what: str, got: FusedTracks, wanted: FusedTracks, tolerance: float | Array) -> None:
+    apart, most = _apart(got, wanted), np.max(tolerance, initial=0.0)
+    text = f"{what}: expected the same within {most:.2g} standard deviations, got {apart.max(initial=0.0):.2g}."
+    _require((apart <= tolerance).all(), text)
+
+
+def _different(what: str, got: FusedTracks, wanted: FusedTracks, least: float = DIFFERENT) -> None:
+    apart = _apart(got, wanted).max(initial=0.0)
+    _require(not apart <= least, f"{what}: expected another result, as is claimed, got one {apart:.2g} away.")
+
+
+def described(rule: Rule, example: Example, rng: Rng) -> str | None:
+    """The descriptor says what a user needs: key, title, caveat, source, cost, the meaning of each parameter."""
+    _require(rule.key.isidentifier() and rule.key.islower(), f"key: expected lower_case, got '{rule.key}'.")
+    texts = {name: getattr(rule, name) for name in ("title", "caveat", "source", "cost")}
+    texts |= {f"parameter '{name}'": spec.doc for name, (spec, _) in specs(rule.params).items()}
+    for name, text in {**texts, "fuse": rule.fuse.__doc__}.items():
+        _require(text, f"{name}: expected a text that describes it, got none.")
+    for name in ("params", "guaranteed"):
+        _require(getattr(example, name), f"Example.{name}: expected one set of parameters at least, got none.")
+    claim = rule.affine_equivariant
+    good = isinstance(claim, str) == bool(example.not_equivariant)
+    _require(good, f"Example.not_equivariant: expected just where affine_equivariant is a text, got {claim!r}.")
+    return None
+
+
+@_in_each_case((1, 2, 3, 5))
+def sound(case: Case, rng: Rng) -> None:
+    """Shapes fit for any leading axes, covariances are symmetric and definite, the tracks stay as they were."""
+    for lead in ((), (1,), (3, 4), (0,)):
+        tracks = case.tracks(rng, lead)
+        before = [array.copy() for array in arrays_of(tracks)]
+        fused = case.fuse(tracks)
+        for name, array, wanted in _shapes(fused, lead, case.count):
+            _require(np.shape(array) == wanted, f"{name}: expected the shape {wanted}, got {np.shape(array)}.")
+        _require(np.array_equal(fused.cov, transpose(fused.cov)), "cov: expected symmetric, got others.")
+        _require((np.linalg.eigvalsh(fused.cov) > 0).all(), "cov: expected positive definite, got others.")
+        _require(np.isfinite(fused.mean).all(), "mean: expected finite, got others.")
+        _require(np.all(fused.info.get("converged", True)), "info converged: expected everywhere.")
+        kept = all(map(np.array_equal, before, arrays_of(tracks)))
+        _require(kept, "tracks: expected to be left as they were, got them changed.")
+
+
+def _shapes(fused: FusedTracks, lead: tuple[int, ...], count: int) -> Iterator[tuple[str, Any, tuple[int, ...]]]:
+    yield "mean", fused.mean, (*lead, AXES)
+    yield "cov", fused.cov, (*lead, AXES, AXES)
+    if fused.weights is not None:
+        yield "weights", fused.weights, (*lead, count)
+    if fused.mixture is not None:
+        parts = fused.mixture.count
+        yield "mixture.mean", fused.mixture.mean, (*lead, parts, AXES)
+        yield "mixture.cov", fused.mixture.cov, (*lead, parts, AXES, AXES)
+    yield from ((f"info {k}", fused.info[k], lead) for k in ("converged", "iterations") if k in fused.info)
+
+
+@_in_each_case((1, 2, 3, 5))
+def batch_equals_loop(case: Case, rng: Rng) -> None:
+    """A batch gives what its members give one by one."""
+    tracks = case.tracks(rng, (3, 4))
+    whole = case.fuse(tracks)
+    for i in np.ndindex(3, 4):
+        alone = case.fuse(select(tracks, i))
+        _same(f"member {i} of a batch", alone, FusedTracks(whole.mean[i], whole.cov[i]), 1e-9)
+        if whole.weights is not None:
+            good = alone.weights is not None and np.allclose(alone.weights, whole.weights[i], rtol=0, atol=1e-8)
+            _require(good, f"weights of member {i}: expected {whole.weights[i]}, got {alone.weights}.")
+
+
+@_in_each_case((1, 2, 3, 5))
+def copies_of_a_track(case: Case, rng: Rng) -> str | None:
+    """One track alone comes back as it is; so do copies of it, if that is claimed, and else they do not."""
+    if case.count > 1 and case.example.idempotent is None:
+        return "One track comes back; of copies of one nothing is stated (Example.idempotent)."
+    one = dataclasses.replace(case, count=1).tracks(rng, (5,))
+    copies = select(dataclasses.replace(one, extras={}), (slice(None), np.zeros(case.count, int)))
+    fused, wanted = case.fuse(case.equipped(rng, copies)), FusedTracks(one.mean[:, 0], one.cov[:, 0])
+    if case.count == 1 or case.example.idempotent:
+        _same("copies of a track", fused, wanted, case.tolerance(fused, 1e-9))
+    else:
+        _different("copies of a track", fused, wanted)
+    return None
+
+
+@_in_each_case((2, 3, 5))
+def order_of_sources(case: Case, rng: Rng) -> None:
+    """The order of the sources does not matter, unless that is claimed, and then it does for more than two."""
+    tracks, order = case.tracks(rng, (20,)), np.roll(np.arange(case.count), 1)
+    turned = {k: tuple(getattr(case.params, k)[i] for i in order) for k, v in case.values.items() if v is EACH}
+    first = case.fuse(tracks)
+    second = case.rule(select(tracks, (slice(None), order)), dataclasses.replace(case.params, **turned))
+    if case.rule.order_matters and case.count > 2:
+        _different("sources in another order", second, first, 1e-6)
+    else:
+        _same("sources in another order", second, first, case.tolerance(first, 1e-8))
+
+
+@_in_each_case((2, 3, 5))
+def affine_equivariance(case: Case, rng: Rng) -> None:
+    """In other axes and units the result is the same, unless that is denied, and then it is another."""
+    tracks = case.tracks(rng, (20,))
+    matrix, shift = np.diag([1e-3, 1.0, 30.0, 1e3]) @ rng.normal(size=(AXES, AXES)), rng.normal(size=AXES)
+
+    def move(mean: Array, cov: Array) -> tuple[Array, Array]:
+        return mean @ matrix.T + shift, symmetrise(matrix @ cov @ matrix.T)
+
+    mixture = tracks.mixture and Mixture(tracks.mixture.weight, *move(tracks.mixture.mean, tracks.mixture.cov))
+    here = case.fuse(tracks)
+    there = case.fuse(case.equipped(rng, SourceTracks(*move(tracks.mean, tracks.cov), tracks.dof, mixture)))
+    moved = FusedTracks(*move(here.mean, here.cov))
+    if case.rule.affine_equivariant is False or case.values in case.example.not_equivariant:
+        _different("other axes", there, moved)
+    else:
+        _same("other axes", there, moved, case.tolerance(there, 1e-7))
+
+
+@_in_each_case((1, 2, 3))
+def linearity(case: Case, rng: Rng) -> str | None:
+    """The mean is linear in the means, and all else depends on the covariances alone, if that is claimed."""
+    if not case.rule.linear:
+        return "It is not claimed."
+    _, fused = linear_estimate(case, case.tracks(rng, (), n=2))
+    for name, array in (("cov", fused.cov), ("weights", fused.weights)):
+        _require(array is None or np.allclose(array, array[:1], 1e-9), f"{name}: expected the same for all means.")
+    return None
+
+
+@_in_each_case((2, 3), "guaranteed")
+def guarantee(case: Case, rng: Rng) -> str | None:
+    """The covariance is not too small for any sampled correlation of the errors, if that is guaranteed."""
+    if case.rule.guarantee not in ("conservative", "exact"):
+        return f"Nothing to hold: the guarantee is '{case.rule.guarantee}'."
+    worst = max(worst_error(case, rng) for _ in range(DRAWS))
+    _require(worst <= 1.0 + 1e-9, f"error variance over the claimed one: expected at most 1, got {worst:.6g}.")
+    _require(worst > TELLING, f"largest error variance over the claimed one: expected near 1, got {worst:.3g}.")
+    return None
+
+
+def counter_example(rule: Rule, example: Example, rng: Rng) -> str | None:
+    """A rule that promises less shows by how much; one that is conservative has nothing to show."""
+    if rule.guarantee not in ("none", "structural"):
+        _require(example.counter_example is None, f"guarantee '{rule.guarantee}': expected no counter-example.")
+        return f"Nothing to show: the guarantee is '{rule.guarantee}'."
+    if example.counter_example is None:
+        return "None is stated (Example.counter_example)."
+    ratio, stated = example.counter_example()
+    text = f"error variance over the claimed one: expected {stated:.4g}, as is stated, and above 1, got {ratio:.4g}."
+    _require(stated > 1.0 and abs(ratio - stated) <= 1e-2 * stated, text)
+    return None
+
+
+LAWS: tuple[Law, ...] = (
+    described, sound, batch_equals_loop, copies_of_a_track, order_of_sources, affine_equivariance, guarantee, linearity,
+    counter_example,
+)  # fmt: skip
