@@ -216,8 +216,9 @@ def _error(part: Array, slope: Array, curvature: Array) -> Array:
     At an end the slope may lead outwards: by that much omega is sure not to come in.
     """
     count = part.shape[-1]
-    even = part[:, : count - count % BATCHES].reshape(len(part), -1, BATCHES)
-    spread = even.sum(1).std(-1, ddof=1) * np.sqrt(BATCHES)
+    batches = min(BATCHES, count)
+    even = part[:, : count - count % batches].reshape(len(part), count // batches, batches)
+    spread = even.sum(1).std(-1, ddof=1) * np.sqrt(batches)
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.maximum(STANDARD_ERRORS * spread - np.abs(slope), 0.0) / curvature
     # Densities that differ nowhere have no best exponent, and need none.

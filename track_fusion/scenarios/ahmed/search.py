@@ -65,7 +65,7 @@ RULE_CHOICES = (
     RuleChoice("mixture_exact", dataclasses.replace(PAPER, proposal="heavy_tail"), "heavy_tail"),
     RuleChoice("mixture_exact", dataclasses.replace(PAPER, method="igs", samples=2000), "igs"),
     RuleChoice("mixture_exact", dataclasses.replace(PAPER, method="mmgd"), "mmgd"),
-    RuleChoice("mixture_wep", MixtureWepParams(method="dls", max_components=COMPONENTS)),
+    RuleChoice("mixture_wep", MixtureWepParams(method="dls", max_components=COMPONENTS, omega_error=1.0)),
     RuleChoice("mixture_wep", MixtureWepParams(method="naive_bayes", max_components=COMPONENTS), "naive_bayes"),
 )
 #: The centre; robot 3 before it hears of the others; the quotient of the robots' mixtures itself, on the grid.
