@@ -91,6 +91,8 @@ DIAGNOSTICS: dict[str, tuple[Callable[..., NDArray[Any]], float]] = {
     "log_eta": (np.add, 0.0),
     "pruned": (np.maximum, 0.0),
     "skipped": (np.add, 0),
+    "undecided": (np.add, 0),
+    "least_difference": (np.minimum, 1.0),
 }
 
 
