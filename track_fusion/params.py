@@ -25,6 +25,10 @@ class ParameterError(ValueError):
     """A parameter has a wrong name or value; the message names it, the limit and the value got."""
 
 
+class Fault(Exception):
+    """What a program cannot go on with, through no parameter: it ends with exit code 1 and this message, one line."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Spec:
     """What is known of one parameter besides its name and default."""

@@ -131,10 +131,7 @@ def from_file(path: str, name: str, kind: type[T]) -> T:
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
-    given = getattr(module, name, None)
-    if not isinstance(given, kind):
-        raise ParameterError(f"The file '{path}' must define {name}, a {kind.__name__}. Got {given!r}.")
-    return given
+    return _of_kind(getattr(module, name, None), kind, f"The file '{path}' must define {name}, a")
 
 
 def from_module(name: str, kind: type[T]) -> T:
@@ -148,6 +145,10 @@ def from_module(name: str, kind: type[T]) -> T:
         given = pkgutil.resolve_name(name)
     except (ImportError, AttributeError, ValueError) as error:
         raise ParameterError(f"There is no '{name}': {error}") from error
+    return _of_kind(given, kind, f"'{name}' must be a")
+
+
+def _of_kind(given: object, kind: type[T], wanted: str) -> T:
     if not isinstance(given, kind):
-        raise ParameterError(f"'{name}' must be a {kind.__name__}. Got {given!r}.")
+        raise ParameterError(f"{wanted} {kind.__name__}. Got {given!r}.")
     return given

@@ -313,8 +313,8 @@ def test_a_target_and_likelihoods_reach_the_average() -> None:
         params = json.dumps({"criterion": criterion})
         result = run("fuse", "--rule", "arithmetic_average", "--params", params, stdin=json.dumps(data))
         assert result.exit_code == 0, result.stderr
-        found: list[float] = strict_json(result.stdout)["weights"]
-        return found
+        given: list[float] = strict_json(result.stdout)["weights"]
+        return given
 
     likely = [{**FIRST, "likelihood": 3}, {**SECOND, "likelihood": 1}]
     assert weights("likelihood", {"tracks": likely}) == pytest.approx([0.75, 0.25])

@@ -122,9 +122,9 @@ def test_the_own_scenario_is_judged(examples: Path, tmp_path: Path) -> None:
 def compared(*words: str) -> dict[str, Any]:
     result = run("compare", *words, "--json")
     assert result.exit_code == 0, result.stderr
-    found = strict_json(result.stdout)
-    assert isinstance(found, dict)
-    return found
+    answer = strict_json(result.stdout)
+    assert isinstance(answer, dict)
+    return answer
 
 
 def test_rules_are_compared_under_the_same_noise(examples: Path) -> None:
@@ -153,6 +153,7 @@ def test_parameters_are_given_by_rule(examples: Path) -> None:
     assert means[0] != means[1]
 
 
+@pytest.mark.slow
 def test_the_figures_depend_on_the_seed_alone(examples: Path) -> None:
     words = (str(examples / "two_thermometers.py"), "--rules", "naive", "--runs", "1100")
     assert compared(*words, "--jobs", "1") == compared(*words, "--jobs", "3")
@@ -220,7 +221,7 @@ def test_an_interrupted_study_goes_on(examples: Path, tmp_path: Path) -> None:
     kept[0].unlink()
     with np.load(kept[1]) as arrays:
         changed = {name: arrays[name] for name in arrays.files}
-    changed["sample/given-naive"] = np.full_like(changed["sample/given-naive"], 100.0)
+    changed["outcome/given-naive"] = np.full_like(changed["outcome/given-naive"], 100.0)
     before = kept[2].stat().st_mtime_ns
     assert run(*words, "--runs", "2000").stdout == whole
     np.savez(kept[1], **changed)

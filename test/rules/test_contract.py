@@ -13,8 +13,7 @@ from rules.examples import COUNTER_EXAMPLES, covariances, joint_covariances
 
 from track_fusion.params import ParameterError, Params, from_dict, specs
 from track_fusion.rules import RULES, Example, FusedTracks, Rule, SourceTracks, get_rule
-from track_fusion.rules.contract import LAWS, BrokenLaw, check
-from track_fusion.rules.trials import Case, worst_error
+from track_fusion.rules.contract import LAWS, BrokenLaw, Case, check
 
 EVERY_RULE = pytest.mark.parametrize("rule", RULES.own.values(), ids=RULES.own)
 BY_NAME = {law.__name__: law for law in LAWS}
@@ -164,7 +163,7 @@ def test_what_the_example_does_not_state_is_passed_over() -> None:
 
 def test_the_samples_would_catch_a_rule_that_is_not_conservative() -> None:
     rng, naive = np.random.default_rng(6), get_rule("naive")
-    assert max(worst_error(Case(naive, naive.example, {}, 2), rng) for _ in range(5)) > 1.5
+    assert max(Case(naive, naive.example, {}, 2).worst_error(rng) for _ in range(5)) > 1.5
 
 
 def test_extras_of_ones_own_reach_the_rule() -> None:
@@ -173,7 +172,7 @@ def test_extras_of_ones_own_reach_the_rule() -> None:
         assert tracks.extras["a_map"].shape == tracks.mean.shape
         return _mean(tracks, params)
 
-    def extras(rng: np.random.Generator, tracks: SourceTracks) -> Mapping[str, Any]:
+    def extras(tracks: SourceTracks) -> Mapping[str, Any]:
         return {"a_map": np.zeros(tracks.mean.shape)}
 
     rule = dataclasses.replace(GOOD, fuse=fuse, needs=("a_map",), example=Example(idempotent=True, extras=extras))

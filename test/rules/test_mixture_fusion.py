@@ -7,21 +7,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-from densities.mixture.test_integrability import Problem as Integral
-from densities.mixture.test_integrability import problems as problems_with_integral
-from densities.mixture.test_integrability import taken, verdict
-from densities.mixture.test_mixture import draw
-from rules.test_mixture_averages import as_tracks
+from densities.mixture.examples import draw
+from densities.mixture.integrals import Problem as Integral
+from densities.mixture.integrals import problems as problems_with_integral
+from densities.mixture.integrals import taken, verdict
+from rules.mixtures import as_tracks
 
 from track_fusion.densities.log_domain import normalised
 from track_fusion.densities.mixture.algebra import LogMixture, first_order, power, product
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments, sample
 from track_fusion.densities.mixture.sampling import Weighted, single_shot_em
+from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.linalg import Array
 from track_fusion.params import from_dict
 from track_fusion.rules import FusedTracks, SourceTracks, get_rule, mixture_exact
 from track_fusion.rules.shared import sampling
-from track_fusion.scenarios.ahmed.mixtures import Problem, divergence, log_fused
+from track_fusion.scenarios.ahmed.mixtures import Problem, log_fused
 from track_fusion.scenarios.ahmed.random import study_problem
 
 
@@ -43,7 +44,7 @@ def _median(problems: list[Problem], **values: Any) -> float:
     far = []
     for p in problems:
         fused = run("mixture_exact", p.tracks(np.random.default_rng(1)), max_components=0, **values)
-        far.append(divergence(p.log_exact(), log_fused(fused)))
+        far.append(kl_on_grid(p.log_exact(), log_fused(fused)))
     return float(np.median(far))
 
 

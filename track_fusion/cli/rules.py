@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from track_fusion.rules import Rule
 
 
-@click.command(short_help="List the fusion rules and their parameters, or check one against the laws.")
+@click.command(short_help="List the fusion rules, or check one against the laws.")
 @click.option("--check", "name", metavar="RULE", help="Hold a rule against the laws: a key, a .py file, module:RULE.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.pass_context

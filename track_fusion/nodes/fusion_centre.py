@@ -12,24 +12,26 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
+from msg_adapters.arrays import CrossBlock
 from msg_adapters.header import check_header
 from msg_adapters.markers import markers_to_msg
 from msg_adapters.odometry import odometry_to_msgs
 from msg_adapters.track_table import track_table_to_msg
-from msg_adapters.types import MESSAGE_TYPES, CrossBlock, MessageType
+from msg_adapters.types import MESSAGE_TYPES, MessageType
 from track_fusion.centre.centre import FusionCentre
 from track_fusion.centre.config import (
     MAX_SOURCES,
     CentreConfig,
     FusionCentreParams,
-    RuleParams,
     ScanBufferParams,
     SourceConfig,
+    StateFusionParams,
     TrackManagerParams,
 )
 from track_fusion.centre.publish import StepInfo
 from track_fusion.models.choices import MOTIONS, MotionChoice
-from track_fusion.nodes.managed import ManagedNode, end, run
+from track_fusion.nodes.managed import ManagedNode
+from track_fusion.nodes.process import end, run
 from track_fusion.nodes.ros_params import chosen, declare
 from track_fusion.nodes.screening import FrameParams, screened_tracks
 from track_fusion.params import ParameterError, Params, param
@@ -92,7 +94,7 @@ class FusionCentreNode(ManagedNode):
         self.frame, self.sources = declare(self, FrameParams), declare(self, SourceParams)
         self.kinds = self.sources.kinds
         motion = chosen(self, MOTIONS, declare(self, MotionChoice).motion, StateLayout(self.frame.axes))
-        rule = RULES[declare(self, RuleParams).state_fusion]
+        rule = RULES[declare(self, StateFusionParams).state_fusion]
         rules = {**RULES.own, rule.key: rule}
         rule_params = {key: declare(self, each.params, f"{key}.") for key, each in rules.items()}
         names = zip(self.sources.source_configurations, self.kinds, strict=True)
@@ -194,7 +196,7 @@ class FusionCentreNode(ManagedNode):
         values: dict[str, Any] = {"rule": rule.key, "tracks": len(self.centre.tracks)}
         values["step_s"] = round(self._latency_s, 6)
         for k, name in enumerate(self.sources.source_configurations):
-            silence = self.centre.silence_s(k, self.now_ns())
+            silence = self.centre.buffer.silence_s(k, self.now_ns())
             values[f"silence_s/{name}"] = round(silence, 3)
             if silence >= timeout_s:
                 warnings.append(f"{name} is silent for {silence:.1f} s")

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from track_fusion.densities.gaussian import merge, merge_near
+from track_fusion.densities.gaussian import merge_near
 from track_fusion.densities.mixture.algebra import average
-from track_fusion.linalg import Array
+from track_fusion.linalg import Array, merged_moments
 from track_fusion.params import param
 from track_fusion.rules.base import Example, FusedTracks, Mixture, Rule, SourceTracks
 from track_fusion.rules.shared.weights import GIVEN, UNIFORM, WeightParams, diagnostics
@@ -71,7 +71,7 @@ def fuse(tracks: SourceTracks, params: ArithmeticAverageParams) -> FusedTracks:
                    Density Fusion, eqs. (6), (10)-(11), (37), (39), (40), (45), section II-E.
     """
     weights, info = _weights(tracks, params)
-    mean, cov = merge(tracks.mean, tracks.cov, weights)
+    mean, cov = merged_moments(tracks.mean, tracks.cov, weights)
     mixture = None
     if params.output == "mixture":
         mixture = _mixture(tracks, weights)
@@ -113,7 +113,7 @@ def _sought(tracks: SourceTracks, criterion: str) -> Solution:
 def _target_slopes(tracks: SourceTracks) -> Array:
     """Linear part of (39), (..., K): tr(P^-1 (P_i + (x_i - x)(x_i - x)')) for a target of moments x, P."""
     target: Mixture = tracks.extras["target"]
-    mean, cov = merge(target.mean, target.cov, target.weight / target.weight.sum(-1, keepdims=True))
+    mean, cov = merged_moments(target.mean, target.cov, target.weight / target.weight.sum(-1, keepdims=True))
     offset = tracks.mean - mean[..., None, :]
     second = tracks.cov + offset[..., :, None] * offset[..., None, :]
     slopes = np.trace(np.linalg.solve(cov[..., None, :, :], second), axis1=-2, axis2=-1)

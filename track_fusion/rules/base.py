@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.mixture.mixture import Mixture as Mixture
+from track_fusion.densities.mixture.mixture import gaussian, moments
 from track_fusion.linalg import Array, asymmetric, is_positive_definite, symmetrise
 from track_fusion.params import Params
 
@@ -39,6 +40,11 @@ class SourceTracks:
     dof: Array | None = None
     mixture: Mixture | None = None
     extras: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def of(cls, densities: Mixture, **extras: Any) -> SourceTracks:
+        """Make tracks of K mixtures (..., K, C); those of one component are Gaussian tracks."""
+        return cls(*moments(densities), mixture=densities if densities.count > 1 else None, extras=extras)
 
     @property
     def count(self) -> int:
@@ -76,6 +82,11 @@ class FusedTracks:
     mixture: Mixture | None = None
     info: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
+    @property
+    def density(self) -> Mixture:
+        """The fused mixture, or the Gaussian of the moments, of one component."""
+        return gaussian(self.mean, self.cov) if self.mixture is None else self.mixture
+
     def shaped(self, batch: tuple[int, ...]) -> FusedTracks:
         """Give the arrays of a flat batch (B, ...) their leading axes back."""
 
@@ -104,8 +115,8 @@ class Example:
     #: by how many standard deviations moments may vary with the random numbers, if every sample is effective; where
     #: parameters name a number of samples
     monte_carlo: float = 0.0
-    #: (rng, tracks) -> extras that the rule needs and that `contract.EXTRAS` does not know
-    extras: Callable[[np.random.Generator, SourceTracks], Mapping[str, Any]] | None = None
+    #: tracks -> extras that the rule needs and that `contract.EXTRAS` does not know; they must move with the tracks
+    extras: Callable[[SourceTracks], Mapping[str, Any]] | None = None
     #: for guarantee none or structural: the true error variance over the claimed one, measured and as stated
     counter_example: Callable[[], tuple[float, float]] | None = None
 

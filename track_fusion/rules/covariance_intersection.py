@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.gaussian import keep_sole, weighted_product
-from track_fusion.linalg import Array, inverse, matvec, outer, symmetrise, transpose
+from track_fusion.densities.gaussian import weighted_product
+from track_fusion.linalg import Array, inverse, keep_sole, matvec, outer, symmetrise, transpose
 from track_fusion.params import param
 from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks, Values
 from track_fusion.rules.shared.weights import GIVEN, TRACE, UNIFORM, WeightParams, diagnostics, pooled

@@ -23,7 +23,7 @@ class CrossCovarianceParams(Params):
     method: str = param(
         "correlation",
         "correlation: assume the coefficient 'correlation' between any two tracks; given: take the cross-covariances "
-        "that come with the tracks (filters.cross_covariance computes them from the local Kalman gains)",
+        "that come with the tracks (Bar-Shalom's recursion has them from the local Kalman gains)",
         choices=("correlation", "given"),
     )
     correlation: float = param(

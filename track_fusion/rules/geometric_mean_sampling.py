@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.mean_density import fit_mean_density, sample_mean_density
 from track_fusion.densities.mixture.algebra import LogMixture, product
+from track_fusion.densities.mixture.mean_density import fit_mean_density, sample_mean_density
 from track_fusion.densities.mixture.mixture import Mixture, chosen, same
 from track_fusion.params import param
 from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.mean_density import fit_mean_density, sample_mean_density
 from track_fusion.densities.mixture.algebra import LogMixture, product
+from track_fusion.densities.mixture.mean_density import fit_mean_density, sample_mean_density
 from track_fusion.densities.mixture.mixture import Mixture, chosen, moments, same, stacked
 from track_fusion.linalg import Array, matvec, outer, transpose
 from track_fusion.params import param
@@ -99,13 +99,12 @@ def _fuse_by_sampling(
     """Fuse by HMD-S; the weights (77) are those of the Gaussians with the densities' moments."""
 
     def step(first: Mixture, second: Mixture, k: int) -> Step:
-        lead, n = first.weight.shape[:-1], first.mean.shape[-1]
-        (x1, p1), (x2, p2) = (_flat(*moments(m), n) for m in (first, second))
-        pair = Pair.of(p1, p2)
+        lead, parts = first.weight.shape[:-1], stacked(first, second)
+        mean, cov = SourceTracks(*moments(parts)).flat
+        pair = Pair.of(cov[:, 0], cov[:, 1])
         share = None if given is None else share_of_first(given, k)
-        search = _search(pair, pair.coordinates(x1 - x2), params.criterion, share)
+        search = _search(pair, pair.coordinates(mean[:, 0] - mean[:, 1]), params.criterion, share)
         omega = search.weights.reshape(lead)
-        parts = stacked(first, second)
         weights = np.stack([omega, 1.0 - omega], -1)
         drawn = sample_mean_density(parts, weights, "harmonic", rngs[k - 1], params.samples, params.inflation)
         fused = fit_mean_density(drawn, product(LogMixture.of(first), LogMixture.of(second)))
@@ -121,11 +120,6 @@ def _fuse_by_sampling(
 
     fused = fold_mixtures(tracks, params, step, ("converged", "iterations", "ess", "log_eta"))
     return fused if tracks.mixture is not None else dataclasses.replace(fused, mixture=None)
-
-
-def _flat(mean: Array, cov: Array, n: int) -> tuple[Array, Array]:
-    size = mean.size // n
-    return mean.reshape(size, n), cov.reshape(size, n, n)
 
 
 def _search(pair: Pair, difference: Array, criterion: str, share: float | None) -> Solution:

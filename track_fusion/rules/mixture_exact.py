@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from track_fusion.densities.log_domain import log_sum_exp, normalised
 from track_fusion.densities.mixture.integrability import EFFECTIVE, effective_share, integrability
-from track_fusion.densities.mixture.mixture import Factored, Mixture, chosen, moments, same, sample
+from track_fusion.densities.mixture.mixture import Factored, Mixture, chosen, moments, same, sample, take_components
 from track_fusion.densities.mixture.proposals import (
     MOST_SPREAD,
     indirect_global_sampling,
@@ -264,25 +264,20 @@ def _dls(problem: Problem, params: MixtureExactParams, rng: np.random.Generator)
     kept = prune_mixands(quotient, bound.log_weight, found.log_moment, params.prune_nats)
 
     def approximate() -> Laplace:
-        return Laplace(*(_take(a, kept.order) for a in found))
+        return Laplace(*(take_components(a, kept.order) for a in found))
 
     def wide(near: Laplace) -> Array:
         """Covariances of the Gaussians above the mixands; where there is none, the widest that heavy tails allow."""
-        sure = _take(bound.sure, kept.order)
-        return np.where(sure[..., None, None], _take(bound.cov, kept.order), MOST_SPREAD * near.cov)
+        sure = take_components(bound.sure, kept.order)
+        return np.where(sure[..., None, None], take_components(bound.cov, kept.order), MOST_SPREAD * near.cov)
 
     mixture, more = sample_mixands(kept, problem.first, problem.second, approximate, wide, params, rng)
     return mixture, info | more
 
 
-def _take(array: NDArray[Any], order: NDArray[np.intp]) -> NDArray[Any]:
-    tail = (1,) * (array.ndim - order.ndim)
-    return np.take_along_axis(array, order.reshape(*order.shape, *tail), order.ndim - 1)
-
-
 def _igs(problem: Problem, params: MixtureExactParams, rng: np.random.Generator) -> Result:
     quotient, _, found, info = _prepared(problem, params, rng)
-    proposal = laplace_proposal(quotient, params.inflation, found)
+    proposal = laplace_proposal(found, params.inflation)
     result = indirect_global_sampling(quotient, proposal, rng, params.samples)
     ess = result.samples.ess / params.samples
     return result.mixture, info | {"ess": ess, "log_eta": result.samples.log_eta}
@@ -298,9 +293,7 @@ def _laplace(problem: Problem, params: MixtureExactParams, rng: np.random.Genera
 def _mmgd(problem: Problem, params: MixtureExactParams, rng: np.random.Generator) -> Result:
     divided, proper = moment_matched(problem.quotient, *moments(problem.common))
     bad = ~proper & np.isfinite(divided.log_weight)
-    quotient, skipped = problem.admitted(
-        bad, params, "along some direction their product falls no faster than 'common'"
-    )
+    quotient, skipped = problem.admitted(bad, params, NO_FASTER)
     weight = np.where(np.isfinite(quotient.numerator.log_weight), divided.log_weight, -np.inf)
     fused = divided._replace(log_weight=weight).normalised
     return fused, {"skipped": skipped, "log_eta": log_sum_exp(weight)}
@@ -309,8 +302,7 @@ def _mmgd(problem: Problem, params: MixtureExactParams, rng: np.random.Generator
 def _common_proposal(problem: Problem, params: MixtureExactParams, rng: np.random.Generator) -> Result:
     quotient, _, info = _decided(problem, params, rng)
     points = sample(problem.common, rng, params.samples).points
-    weight, mean, cov = quotient.numerator
-    above = Factored.of(Mixture(np.ones(weight.shape), mean, cov), weight).log_pdf(points)
+    above = quotient.numerator.factored.log_pdf(points)
     drawn = Weighted(points, above - 2.0 * Factored.of(problem.common).log_pdf(points))
     learned = weighted_em(drawn, params.learned_count(problem.first, problem.second), rng)
     more = {"converged": learned.converged, "ess": drawn.ess / params.samples, "log_eta": drawn.log_eta}

@@ -87,7 +87,7 @@ def _weights(mean: Array, cov: Array, pull: Array, radius: Array, weight: Array)
     # The first search wins unless another is lower by more than rounding.
     value[1:] = np.where(value[1:] < value[0] * (1.0 - TIE), value[1:], np.inf)
     best = value.argmin(0) * batch + np.arange(batch)
-    return Solution(search.weights[best], search.converged[best], search.iterations[best])
+    return search[best]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.linalg import Array, inverse, matvec, symmetrise, transpose
-from track_fusion.params import param
-from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks, Values
-from track_fusion.rules.shared.weights import GIVEN, TRACE, UNIFORM, WeightParams, diagnostics
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.covariance_intersection import EXAMPLES, CovarianceIntersectionParams
+from track_fusion.rules.shared.weights import TRACE, diagnostics
 from track_fusion.solvers.optimise import GradientHessian, minimise_on_simplex
 
 #: An independent part may leave the range from nothing to the covariance by this share of that: rounding.
@@ -20,15 +20,8 @@ SMALLEST = 1e-14
 
 
 @dataclasses.dataclass(frozen=True)
-class SplitCovarianceIntersectionParams(WeightParams):
+class SplitCovarianceIntersectionParams(CovarianceIntersectionParams):
     """How the fusion weights omega are chosen."""
-
-    criterion: str = param(
-        "det",
-        "what the weights minimise: the fused determinant (does not depend on units), the fused trace "
-        "(does), nothing (uniform), or nothing (given by 'weights')",
-        choices=("det", "trace", "uniform", "given"),
-    )
 
 
 def fuse(tracks: SourceTracks, params: SplitCovarianceIntersectionParams) -> FusedTracks:
@@ -176,8 +169,6 @@ def _gradient_hessian(parts: _Parts, criterion: str) -> GradientHessian:
 
     return gradient_hessian
 
-
-EXAMPLES: tuple[Values, ...] = ({}, TRACE, UNIFORM, GIVEN)
 
 RULE = Rule(
     key="split_covariance_intersection",

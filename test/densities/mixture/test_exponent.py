@@ -10,15 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from densities.mixture.test_mixture import draw
-from densities.mixture.test_quotient import FIRST, SECOND
-from rules.test_mixture_averages import as_tracks
+from densities.mixture.examples import FIRST, SECOND, draw
+from rules.mixtures import as_tracks
 from scipy.optimize import minimize_scalar
 
 from track_fusion.densities.log_domain import log_sum_exp, normalised
-from track_fusion.densities.mixture.divergence import grid, kl_on_grid, moments_on_grid
 from track_fusion.densities.mixture.exponent import optimise_omega
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf, stacked
+from track_fusion.densities.on_grid import grid, kl_on_grid, moments_on_grid
 from track_fusion.linalg import Array
 from track_fusion.params import from_dict
 from track_fusion.rules import FusedTracks, SourceTracks, get_rule
@@ -51,7 +50,7 @@ def test_omega_is_that_of_quadrature(criterion: str) -> None:
     w = float(search.omega)
     wanted = log_sum_exp(w * log_pdf(FIRST, LINE) + (1 - w) * log_pdf(SECOND, LINE)) + np.log(80.0 / 4000)
     assert search.samples.log_eta == pytest.approx(float(wanted), abs=0.01)
-    mean, cov = moments_on_grid(lambda x: w * log_pdf(FIRST, x) + (1 - w) * log_pdf(SECOND, x), LINE)
+    mean, cov = moments_on_grid(w * log_pdf(FIRST, LINE) + (1 - w) * log_pdf(SECOND, LINE), LINE)
     got = search.samples.moments()
     assert got[0][0] == pytest.approx(mean[0], abs=4 * np.sqrt(cov[0, 0] / float(search.samples.ess)))
     assert got[1][0, 0] == pytest.approx(cov[0, 0], rel=0.05)
@@ -60,11 +59,8 @@ def test_omega_is_that_of_quadrature(criterion: str) -> None:
 def test_chernoff_point_is_equally_far_from_both() -> None:
     """Ahmed (10), which the paper gives as necessary and sufficient."""
     w = float(optimise_omega(FIRST, SECOND, np.random.default_rng(0), 40000).omega)
-
-    def fused(x: Array) -> Array:
-        return w * log_pdf(FIRST, x) + (1 - w) * log_pdf(SECOND, x)
-
-    far = [kl_on_grid(fused, lambda x, m=m: log_pdf(m, x), LINE) for m in (FIRST, SECOND)]
+    logs = log_pdf(FIRST, LINE), log_pdf(SECOND, LINE)
+    far = [kl_on_grid(w * logs[0] + (1 - w) * logs[1], log) for log in logs]
     assert far[0] == pytest.approx(far[1], rel=0.2)
 
 

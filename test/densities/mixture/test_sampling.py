@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from densities.mixture.test_mixture import draw
-from densities.mixture.test_quotient import COMMON, FIRST, SECOND, mixand_moments
+from densities.mixture.examples import COMMON, FIRST, SECOND, draw, mixand_moments
 from scipy import integrate
 
-from track_fusion.densities.mixture.divergence import grid, moments_on_grid
 from track_fusion.densities.mixture.exponent import optimise_omega
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments, sample
 from track_fusion.densities.mixture.proposals import (
@@ -28,6 +26,7 @@ from track_fusion.densities.mixture.sampling import (
     single_shot_em,
     weighted_em,
 )
+from track_fusion.densities.on_grid import grid, moments_on_grid
 from track_fusion.linalg import Array
 
 POINTS = grid(np.array([-40.0]), np.array([40.0]), 4000)
@@ -73,7 +72,7 @@ def test_weighted_em_does_not_depend_on_the_batch() -> None:
 
 def test_single_shot_em_keeps_the_moments_of_the_samples() -> None:
     quotient = exact_quotient(FIRST, SECOND, COMMON)
-    proposal = laplace_proposal(quotient)
+    proposal = laplace_proposal(laplace(quotient))
     drawn = indirect_global_sampling(quotient, proposal, np.random.default_rng(0), 500, floor=0.0)
     for got, wanted in zip(moments(drawn.mixture), drawn.samples.moments(), strict=True):
         np.testing.assert_allclose(got, wanted, rtol=1e-10)
@@ -94,7 +93,7 @@ def test_single_shot_em_survives_mixands_without_samples() -> None:
 def test_igs_and_its_proposal_against_quadrature() -> None:
     quotient = exact_quotient(FIRST, SECOND, COMMON)
     wanted = [mixand_moments(quotient, z) for z in range(4)]
-    found = indirect_global_sampling(quotient, laplace_proposal(quotient), np.random.default_rng(0), 40000)
+    found = indirect_global_sampling(quotient, laplace_proposal(laplace(quotient)), np.random.default_rng(0), 40000)
     total = sum(w[0] for w in wanted)
     assert found.samples.log_eta == pytest.approx(np.log(total), abs=0.02)
     for z, (mass, mean, variance) in enumerate(wanted):
@@ -132,7 +131,7 @@ def test_dls_of_a_weighted_exponential_product_against_quadrature() -> None:
     found = direct_local_sampling(quotient, inflated_naive(quotient, FIRST, SECOND), np.random.default_rng(0), 20000)
     a, b = _log(FIRST), _log(SECOND)
     assert found.log_eta == pytest.approx(np.log(_integral(0.35 * a + 0.65 * b)), abs=0.02)
-    mean, cov = moments_on_grid(lambda x: 0.35 * log_pdf(FIRST, x) + 0.65 * log_pdf(SECOND, x), POINTS)
+    mean, cov = moments_on_grid(0.35 * log_pdf(FIRST, POINTS) + 0.65 * log_pdf(SECOND, POINTS), POINTS)
     got = moments(found.mixture)
     assert got[0][0] == pytest.approx(mean[0], abs=0.05)
     assert got[1][0, 0] == pytest.approx(cov[0, 0], rel=0.05)

@@ -130,7 +130,7 @@ def single_shot_em(samples: Weighted, numerator: LogMixture, floor: float = 0.1,
     """
     parts = numerator.normalised
     if joint is None:
-        joint = Factored.of(parts, numerator.log_weight).joint(samples.points)
+        joint = numerator.factored.joint(samples.points)
     theta = normalised(samples.log_weight)
     top = joint.max(-2, keepdims=True)
     gamma = np.exp(joint - np.where(np.isfinite(top), top, 0.0))

@@ -96,14 +96,7 @@ def fuse_projected(tracks: SourceTracks, params: MhdpParams, scatter: Scatter | 
 
     Returns
     -------
-    FusedTracks    mean (..., n), cov (..., n, n), weights (..., K) of (45), dof (...): the least dof of a target's
-                   tracks for family student_t, else None. info: converged, iterations (of the mean), snapped: the
-                   source whose estimate is the mean, -1 for none
-
-    Raises
-    ------
-    ValueError     beta is given for another family, or too small
-    LinAlgError    a covariance is singular
+    FusedTracks    as of mhdp_iterative
     """
     (mean, cov), (family, dof) = tracks.flat, family_of(tracks, params)
     # Scatters are covariances over kappa, so distances by covariances take c kappa.

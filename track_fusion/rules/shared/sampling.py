@@ -8,7 +8,6 @@ from collections.abc import Callable
 import numpy as np
 
 from track_fusion.densities.mixture.mixture import Mixture, padded
-from track_fusion.linalg import Array
 from track_fusion.rules.base import FusedTracks, SourceTracks
 
 #: Points that a rule samples at once; larger batches are worked on in pieces, to bound the memory.
@@ -46,22 +45,15 @@ def fuse_sampled(
 
 def _piece(tracks: SourceTracks, lead: tuple[int, ...], rows: slice) -> SourceTracks:
     """Cut rows of the batch, flat, out of tracks and of what they have in common."""
-    size = math.prod(lead)
-
-    def cut(array: Array) -> Array:
-        return array.reshape(size, *array.shape[len(lead) :])[rows]
-
-    def cut_mixture(mixture: Mixture) -> Mixture:
-        return Mixture(cut(mixture.weight), cut(mixture.mean), cut(mixture.cov))
-
+    index = np.unravel_index(np.arange(math.prod(lead))[rows], lead)
     extras = dict(tracks.extras)
     if "common" in extras:
         given = extras["common"]
         single = isinstance(given, Mixture)
-        common = [cut_mixture(m.broadcast(lead)) for m in ([given] if single else given)]
+        common = [m.broadcast(lead).at(index) for m in ([given] if single else given)]
         extras["common"] = common[0] if single else common
-    mixture = tracks.mixture and cut_mixture(tracks.mixture)
-    return SourceTracks(cut(tracks.mean), cut(tracks.cov), None, mixture, extras)
+    mixture = tracks.mixture and tracks.mixture.at(index)
+    return SourceTracks(tracks.mean[index], tracks.cov[index], None, mixture, extras)
 
 
 def _joined(results: list[FusedTracks], lead: tuple[int, ...]) -> FusedTracks:

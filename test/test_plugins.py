@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from plugins.packages import install
+from package.packages import install
 
 from track_fusion.params import ParameterError, Params, from_dict, param
 from track_fusion.plugins import Registry, from_module

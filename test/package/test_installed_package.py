@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nodes.support import PATIENT, SECOND_NS, START_S, STEP_S, clock, read
-from plugins.packages import install
+from package.packages import install
 from ros_helpers import NodeProcess, Probe
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
