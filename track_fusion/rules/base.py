@@ -62,6 +62,23 @@ class SourceTracks:
         tail = self.cov.shape[-3:]
         return self.mean.reshape(-1, *tail[:2]), self.cov.reshape(-1, *tail)
 
+    def fused(
+        self,
+        mean: Array,
+        cov: Array,
+        weights: Array | None = None,
+        mixture: Mixture | None = None,
+        info: Mapping[str, NDArray[Any]] | None = None,
+    ) -> FusedTracks:
+        """Return what the flat batch (B, ...) was fused to, with the leading axes of these tracks."""
+        info, batch = info or {}, self.batch
+        if len(batch) != 1:
+            mean, cov = mean.reshape(batch + mean.shape[1:]), cov.reshape(batch + cov.shape[1:])
+            weights = None if weights is None else weights.reshape(batch + weights.shape[1:])
+            mixture = mixture and Mixture(*(a.reshape(batch + a.shape[1:]) for a in vars(mixture).values()))
+            info = {name: array.reshape(batch + array.shape[1:]) for name, array in info.items()}
+        return FusedTracks(mean, cov, weights, mixture=mixture, info=info)
+
 
 @dataclasses.dataclass(frozen=True)
 class FusedTracks:
@@ -86,17 +103,6 @@ class FusedTracks:
     def density(self) -> Mixture:
         """The fused mixture, or the Gaussian of the moments, of one component."""
         return gaussian(self.mean, self.cov) if self.mixture is None else self.mixture
-
-    def shaped(self, batch: tuple[int, ...]) -> FusedTracks:
-        """Give the arrays of a flat batch (B, ...) their leading axes back."""
-
-        def shape(array: NDArray[Any]) -> NDArray[Any]:
-            return array.reshape((*batch, *array.shape[1:]))
-
-        info = {name: shape(array) for name, array in self.info.items()}
-        weights, dof = (None if array is None else shape(array) for array in (self.weights, self.dof))
-        mixture = self.mixture and Mixture(*map(shape, vars(self.mixture).values()))
-        return FusedTracks(shape(self.mean), shape(self.cov), weights, dof, mixture, info)
 
 
 Values = Mapping[str, Any]

@@ -69,7 +69,7 @@ def fuse(tracks: SourceTracks, params: CovarianceIntersectionParams) -> FusedTra
     if weights is not None:
         return pooled(tracks, weights)
     mean, cov, search = _optimal(*tracks.flat, params.criterion)
-    return FusedTracks(mean, cov, search.weights, info=diagnostics(search)).shaped(tracks.batch)
+    return tracks.fused(mean, cov, search.weights, info=diagnostics(search))
 
 
 Fusion = tuple[Array, Array, Solution]
