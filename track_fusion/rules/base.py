@@ -59,6 +59,8 @@ class SourceTracks:
     @property
     def flat(self) -> tuple[Array, Array]:
         """Mean (B, K, n) and cov (B, K, n, n), the leading axes as one."""
+        if self.mean.ndim == 2:
+            return self.mean[None], self.cov[None]
         tail = self.cov.shape[-3:]
         return self.mean.reshape(-1, *tail[:2]), self.cov.reshape(-1, *tail)
 
@@ -71,13 +73,18 @@ class SourceTracks:
         info: Mapping[str, NDArray[Any]] | None = None,
     ) -> FusedTracks:
         """Return what the flat batch (B, ...) was fused to, with the leading axes of these tracks."""
-        info, batch = info or {}, self.batch
-        if len(batch) != 1:
-            mean, cov = mean.reshape(batch + mean.shape[1:]), cov.reshape(batch + cov.shape[1:])
-            weights = None if weights is None else weights.reshape(batch + weights.shape[1:])
-            mixture = mixture and Mixture(*(a.reshape(batch + a.shape[1:]) for a in vars(mixture).values()))
-            info = {name: array.reshape(batch + array.shape[1:]) for name, array in info.items()}
-        return FusedTracks(mean, cov, weights, mixture=mixture, info=info)
+        batch = self.batch
+
+        def shape(array: NDArray[Any]) -> NDArray[Any]:
+            return array.reshape(batch + array.shape[1:]) if batch else array[0, ...]
+
+        return FusedTracks(
+            shape(mean),
+            shape(cov),
+            None if weights is None else shape(weights),
+            mixture=mixture and Mixture(*map(shape, vars(mixture).values())),
+            info={name: shape(array) for name, array in info.items()} if info else {},
+        )
 
 
 @dataclasses.dataclass(frozen=True)

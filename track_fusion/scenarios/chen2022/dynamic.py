@@ -30,7 +30,7 @@ from track_fusion.scenarios.chen2022 import PAPER
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.one_target import drawn, fused_row, same_filters
 from track_fusion.study.rows import Outcomes, Progress, chosen
-from track_fusion.study.rule_choice import RuleChoice, check_needs
+from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.study.scenario import Claim, Scenario
 from track_fusion.study.scene import Tracking
 from track_fusion.tracks import StateLayout
@@ -152,16 +152,10 @@ def squared_errors(
     return squares
 
 
-def compared(
+def scores(
     base: Tracking, choices: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress
 ) -> Outcomes:
-    """Root of the time-averaged squared position error of each run, (R,), under any rules, with both filters.
-
-    Raises
-    ------
-    ParameterError    a rule needs more than the tracks
-    """
-    check_needs(choices)
+    """Root of the time-averaged squared position error of each run, (R,), under any rules, with both filters."""
     errors = squared_errors(base, rows(choices), runs, seed, progress)
     return {f"{row}/position_rmse_m": np.sqrt(squares.mean(1)) for row, squares in errors.items()}
 
@@ -256,5 +250,5 @@ def scenario(key: str, title: str, base: Tracking, table: Mapping[str, Sequence[
         piece=50,
         tracking=base,
         rules=RULE_CHOICES,
-        compare=lambda choices, runs, seed, progress: compared(base, choices, runs, seed, progress),
+        scores=lambda choices, runs, seed, progress: scores(base, choices, runs, seed, progress),
     )

@@ -24,7 +24,7 @@ from track_fusion.rules.shared.elliptical import EllipticalParams
 from track_fusion.scenarios.chen2022 import PAPER
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.rows import Outcomes, Progress, exact_rows
-from track_fusion.study.rule_choice import RuleChoice, compare_each
+from track_fusion.study.rule_choice import RuleChoice, rule_by_rule
 from track_fusion.study.scenario import Claim, Scenario
 
 #: The local estimates of 5.1: means, and scatters (scalar: the squares of scale parameters).
@@ -134,19 +134,14 @@ def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     return measured
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
-    """Rao distance from the barycenter under any rules, a quantity a family; nothing is random.
-
-    Raises
-    ------
-    ParameterError    a rule needs more than the tracks
-    """
+def scores(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
+    """Rao distance from the barycenter under any rules, a quantity a family; nothing is random."""
 
     def measure(choice: RuleChoice) -> Outcomes:
         distances = {name: setting.from_barycenter(setting.fuse(choice)) for name, setting in SETTINGS.items()}
         return {f"rao_distance_{name}_1": np.full(len(runs), value) for name, value in distances.items()}
 
-    return compare_each("given", rules, progress, measure)
+    return rule_by_rule("given", rules, progress, measure)
 
 
 def charts(outcomes: Outcomes) -> list[Chart]:
@@ -231,5 +226,5 @@ SCENARIO = Scenario(
     charts=charts,
     claims=CLAIMS,
     rules=RULE_CHOICES,
-    compare=compare,
+    scores=scores,
 )
