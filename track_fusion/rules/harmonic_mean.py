@@ -207,23 +207,25 @@ def _fuse_at(pair: Pair, x2: Array, e: Array, search: Solution) -> PairFusion:
     return PairFusion(x2 + pair.from_coordinates(pull), cov, search)
 
 
+FOLD = {"combine": "fold"}
+
 RULE = Rule(
     key="harmonic_mean",
     title="Harmonic mean density",
     fuse=fuse,
     params=HarmonicMeanParams,
     family="gaussian",
-    arity="pairwise",
+    arity="n_ary",
     guarantee="none",
     caveat="mean squared errors of up to 1.16 times the claim in the scalar example",
     source="Sharma (31)-(35), (66), (69)-(73), (77)",
     cost="K n^3; K S n^2 by S samples",
-    order_matters=True,
+    order_matters="with combine fold",
     optional=("seed",),
     optional_when=(("seed", "method", "sampling"),),
     affine_equivariant="not with criterion trace: the trace depends on the units of the axes",
     example=Example(
-        ({}, TRACE, GIVEN, {"method": "sampling", "samples": 5000}),
-        not_equivariant=(TRACE,), idempotent=True, monte_carlo=0.15,
+        ({}, TRACE, GIVEN, FOLD, {"method": "sampling", "samples": 5000}),
+        not_equivariant=(TRACE,), ordered=(FOLD,), idempotent=True, monte_carlo=0.15,
     ),
 )  # fmt: skip

@@ -266,12 +266,13 @@ def _dls(problem: Problem, params: MixtureExactParams, rng: np.random.Generator)
     def approximate() -> Laplace:
         return Laplace(*(take_components(a, kept.order) for a in found))
 
-    def wide(near: Laplace) -> Array:
-        """Covariances of the Gaussians above the mixands; where there is none, the widest that heavy tails allow."""
-        sure = take_components(bound.sure, kept.order)
-        return np.where(sure[..., None, None], take_components(bound.cov, kept.order), MOST_SPREAD * near.cov)
+    def above(near: Laplace) -> tuple[Array, Array]:
+        """Gaussians above the mixands; where none is known, the widest that heavy tails allow."""
+        sure, mean, cov = (take_components(a, kept.order) for a in (bound.sure, bound.mean, bound.cov))
+        mean = np.where(sure[..., None], mean, near.mean)
+        return mean, np.where(sure[..., None, None], cov, MOST_SPREAD * near.cov)
 
-    mixture, more = sample_mixands(kept, problem.first, problem.second, approximate, wide, params, rng)
+    mixture, more = sample_mixands(kept, problem.first, problem.second, approximate, above, params, rng)
     return mixture, info | more
 
 
@@ -321,7 +322,7 @@ RULE = Rule(
     params=MixtureExactParams,
     family="mixture",
     arity="pairwise",
-    guarantee="structural",
+    guarantee=lambda params: "none" if params.method == "naive_bayes" else "structural",
     caveat="exact, up to sampling, if the sources are independent but for the common information given; not with "
     "naive_bayes, and roughly with mmgd, laplace and common_proposal",
     source="Ahmed (6), (13), (22), (26)-(37), (46)-(56), Algorithms 2 to 5",

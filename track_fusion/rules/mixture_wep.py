@@ -178,11 +178,11 @@ def _dls(first: Mixture, second: Mixture, search: Omega, params: MixtureWepParam
     likely = np.broadcast_to((search.samples.log_eta - np.log(bound.shape[-1]))[..., None], bound.shape)
     kept = prune_mixands(wep_quotient(first, second, search.omega), bound, likely, params.prune_nats)
 
-    def wide(near: Laplace) -> Array:
-        above = first_order(first, second, search.omega).cov
-        return np.take_along_axis(above, kept.order[..., None, None], -3)
+    def above(near: Laplace) -> tuple[Array, Array]:
+        whole = first_order(first, second, search.omega).take(kept.order)
+        return whole.mean, whole.cov
 
-    return sample_mixands(kept, first, second, lambda: laplace(kept.quotient), wide, params, rng)
+    return sample_mixands(kept, first, second, lambda: laplace(kept.quotient), above, params, rng)
 
 
 def _igs(first: Mixture, second: Mixture, search: Omega, params: MixtureWepParams, rng: np.random.Generator) -> Result:
@@ -205,6 +205,8 @@ def _pcci(first: Mixture, second: Mixture, search: Omega, params: MixtureWepPara
     fused = rule.fuse(SourceTracks(pairs.mean, pairs.cov), rule.params())
     assert fused.weights is not None
     log_weight = (fused.weights * np.where(fused.weights > 0.0, log_of(pairs.weight), 0.0)).sum(-1)
+    # A component without weight has none in any pair, also where its exponent is 0.
+    log_weight = np.where((pairs.weight > 0.0).all(-1), log_weight, -np.inf)
     info = {"converged": fused.info["converged"].all(-1), "iterations": fused.info["iterations"].sum(-1)}
     info["omega_error"] = np.zeros(info["converged"].shape)
     return Mixture(normalised(log_weight), fused.mean, fused.cov), info

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from track_fusion.densities.log_domain import log_of
 from track_fusion.densities.mixture.algebra import LogMixture, gaussian_quotient, power, product
 from track_fusion.densities.mixture.mixture import LOG_2PI, Factored, Mixture, component_index, take_components
-from track_fusion.linalg import Array, cholesky, eliminate, matvec, symmetrise, transpose, whitener
+from track_fusion.linalg import Array, cholesky, eliminate, matvec, solve, symmetrise, transpose, whitener
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,10 +65,11 @@ class Bound(NamedTuple):
     """An upper bound on each mixand's integral: log_weight (..., M) includes the mixand's own weight.
 
     `sure` (..., M) tells where one component of the denominator alone makes the mixand integrable; there the
-    mixand lies below a Gaussian of covariance `cov` (..., M, n, n).
+    mixand lies below a Gaussian of `mean` (..., M, n) and covariance `cov` (..., M, n, n).
     """
 
     log_weight: Array
+    mean: Array
     cov: Array
     sure: NDArray[np.bool_]
 
@@ -86,7 +87,8 @@ def exact_bound(quotient: Quotient, common: Mixture) -> Bound:
     gap = matvec(white[..., None, :, :, :], numerator.mean[..., :, None, :] - common.mean[..., None, :, :])
     info = transpose(image) @ image
     rest = np.eye(n) - info
-    positive, logdet, square = eliminate(rest, matvec(transpose(image), gap))
+    pull = matvec(transpose(image), gap)
+    positive, logdet, square = eliminate(rest, pull)
     half_logdet = -np.log(np.diagonal(white, axis1=-2, axis2=-1)).sum(-1)
     log_scale = 0.5 * n * LOG_2PI + half_logdet - log_of(common.weight)
     kappa = log_scale[..., None, :] + 0.5 * ((gap * gap).sum(-1) + square - logdet)
@@ -96,8 +98,10 @@ def exact_bound(quotient: Quotient, common: Mixture) -> Bound:
     tightest = np.take_along_axis(rest, least[..., None, None], -3)[..., 0, :, :]
     safe = np.where(sure[..., None, None], tightest, np.eye(n))
     cov = symmetrise(lower @ np.linalg.solve(safe, transpose(lower)))
+    force = np.take_along_axis(pull, least[..., None], -2)[..., 0, :]
+    mean = numerator.mean + sure[..., None] * matvec(lower, solve(safe, force[..., None])[..., 0])
     bound = np.where(np.isfinite(numerator.log_weight), np.take_along_axis(kappa, least, -1)[..., 0], 0.0)
-    return Bound(numerator.log_weight + bound, cov, sure)
+    return Bound(numerator.log_weight + bound, mean, cov, sure)
 
 
 def wep_bound(first: Mixture, second: Mixture, omega: Array) -> Array:
