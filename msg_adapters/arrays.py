@@ -122,8 +122,8 @@ class DetectionArrays:
     cov: Floats | None
 
 
-#: The axes that wrap at pi, radians.
-ANGLES = frozenset({"yaw", "bearing", "elevation"})
+#: The axes that wrap at pi, radians: those of `track_fusion.angles`, which adapters do not import.
+ANGLES = frozenset({"yaw", "heading", "course", "roll", "pitch", "bearing", "azimuth", "elevation"})
 
 
 def merged(tracks: TrackLike, axes: Sequence[str]) -> tuple[Floats, Floats]:

@@ -1,4 +1,4 @@
-"""The data model: a state's named axes, and a batch of tracks as a frozen struct of arrays."""
+"""The data model: a batch of tracks as a frozen struct of arrays."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.linalg import ASYMMETRY_TOLERANCE, Array, is_positive_definite, outer, symmetrise, transpose
+from track_fusion import angles
+from track_fusion.layout import StateLayout as StateLayout
+from track_fusion.layout import planar_layout as planar_layout
+from track_fusion.linalg import ASYMMETRY_TOLERANCE, Array, is_positive_definite, symmetrise, transpose
 
 #: Times are integers of nanoseconds.
 SECOND_NS = 1_000_000_000
@@ -27,67 +30,6 @@ UUID_BYTES = 16
 ABSURD = 1e12
 #: How far the weights of a normalised mixture may sum from one.
 WEIGHT_TOLERANCE = 1e-6
-
-_UNITS = {"x": "m", "y": "m", "z": "m", "vx": "m/s", "vy": "m/s", "vz": "m/s",
-          "ax": "m/s^2", "ay": "m/s^2", "az": "m/s^2", "yaw": "rad", "turn_rate": "rad/s",
-          "range": "m", "bearing": "rad", "elevation": "rad", "range_rate": "m/s"}  # fmt: skip
-_ANGLES = frozenset({"yaw", "bearing", "elevation"})
-
-
-@dataclasses.dataclass(frozen=True)
-class StateLayout:
-    """The named axes of a state, in order. Units and angular axes follow from the names.
-
-    Unknown names are allowed and have the unit "" (a state may hold anything).
-    """
-
-    axes: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        if not self.axes or len(set(self.axes)) < len(self.axes):
-            raise ValueError(f"The 'axes' of a layout must be distinct names. Got {self.axes!r}.")
-
-    @property
-    def size(self) -> int:
-        """Number of axes n."""
-        return len(self.axes)
-
-    @cached_property
-    def units(self) -> tuple[str, ...]:
-        """SI unit of each axis."""
-        return tuple(_UNITS.get(a, "") for a in self.axes)
-
-    @cached_property
-    def angular(self) -> NDArray[np.bool_]:
-        """Which axes wrap at pi, shape (n,)."""
-        return np.array([a in _ANGLES for a in self.axes])
-
-    @cached_property
-    def position(self) -> tuple[int, ...]:
-        """Indices of x, y and z, as far as present."""
-        return tuple(self.axes.index(a) for a in ("x", "y", "z") if a in self.axes)
-
-    @cached_property
-    def velocity(self) -> tuple[int, ...]:
-        """Indices of vx, vy and vz, as far as present."""
-        return tuple(self.axes.index(a) for a in ("vx", "vy", "vz") if a in self.axes)
-
-    def indices(self, axes: Sequence[str]) -> tuple[int, ...]:
-        """Return where the named axes stand.
-
-        Raises
-        ------
-        ValueError    an axis is missing; the message names it
-        """
-        missing = [a for a in axes if a not in self.axes]
-        if missing:
-            raise ValueError(f"The layout has no axis {', '.join(missing)}. It has {', '.join(self.axes)}.")
-        return tuple(self.axes.index(a) for a in axes)
-
-
-def planar_layout() -> StateLayout:
-    """Position and velocity in the plane: x, y, vx, vy."""
-    return StateLayout(("x", "y", "vx", "vy"))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -270,26 +212,24 @@ class TrackBatch:
         return self.replace(weight=weight, **fill)
 
     def to_axes(self, layout: StateLayout) -> TrackBatch:
-        """Reorder or marginalise to the axes of another layout.
+        """Reorder or marginalise to the axes of another layout; an axis may wrap there that did not, or sooner.
 
         Raises
         ------
-        ValueError    an axis is missing
+        ValueError    an axis is missing, or its period no multiple of the other layout's
         """
         if layout == self.layout:
             return self
-        at = np.array(self.layout.indices(layout.axes))
-        return self.replace(layout=layout, mean=self.mean[..., at], cov=self.cov[..., at[:, None], at])
+        at = np.array(self.layout.into(layout))
+        mean = angles.wrap(self.mean[..., at], layout.periods)
+        return self.replace(layout=layout, mean=mean, cov=self.cov[..., at[:, None], at])
 
     @cached_property
     def moments(self) -> tuple[Array, Array]:
         """Mean (N, n) and covariance (N, n, n) of each track, its mixture merged."""
         if self.components == 1:
             return self.mean[:, 0], self.cov[:, 0]
-        weight = self.weight / self.weight.sum(1, keepdims=True)
-        mean = np.einsum("nc,nci->ni", weight, self.mean)
-        spread = self.cov + outer(self.mean - mean[:, None])
-        return mean, np.einsum("nc,ncij->nij", weight, spread)
+        return angles.moments(self.weight, self.mean, self.cov, self.layout.periods)
 
 
 _ROW_FIELDS = ("weight", "mean", "cov", "time_ns", "track_id", "source", "status", "existence", "dof")
