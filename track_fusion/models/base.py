@@ -75,4 +75,4 @@ class Sensor(Protocol):
         """Return the derivative of h, (..., n) -> (..., m, n)."""
 
     def residual(self, z: Array, expected: Array) -> Array:
-        """Return z - expected, (..., m), angles wrapped to [-pi, pi)."""
+        """Return z - expected, (..., m), angles the short way round."""

@@ -91,13 +91,12 @@ def _linear(layout: StateLayout, params: LinearParams) -> LinearSensor:
     axes = params.sensor_axes
     if not axes or len(set(axes)) < len(axes):
         raise ParameterError(f"The 'sensor_axes' parameter must hold distinct axes, at least one. Got {list(axes)}.")
-    matrix = np.eye(layout.size)[list(layout.indices(axes))]
-    noise = square_matrix("sensor_cov", params.sensor_cov, len(matrix))
+    noise = square_matrix("sensor_cov", params.sensor_cov, len(axes))
     if not np.isfinite(noise).all() or asymmetric(noise) or not is_positive_definite(noise):
         raise ParameterError(
             f"The 'sensor_cov' parameter must be symmetric and positive definite. Got {list(params.sensor_cov)}."
         )
-    return LinearSensor(axes, matrix, noise)
+    return LinearSensor.reading(layout, axes, noise)
 
 
 #: Sensors by key, made from (layout, params).
