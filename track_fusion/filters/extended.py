@@ -22,7 +22,7 @@ def predict(mean: Array, cov: Array, transition: Transition) -> tuple[Array, Arr
     mean (..., n), cov (..., n, n)
     """
     slope = transition.jacobian(mean) if transition.matrix is None else transition.matrix
-    return transition.advance(mean), symmetrise(slope @ cov @ transpose(slope) + transition.noise)
+    return transition.advance(mean), symmetrise(slope @ cov @ transpose(slope) + transition.noise(mean))
 
 
 def update(mean: Array, cov: Array, z: Array, sensor: Sensor) -> tuple[Array, Array, Innovation]:

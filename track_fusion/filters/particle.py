@@ -95,9 +95,9 @@ def predict(particles: Particles, transition: Transition, rng: Generators) -> Pa
     transition : Transition
     rng : Generators
     """
-    factor = transition.noise_factor
-    draws = normals(rng, (*particles.points.shape[:-1], factor.shape[-1]))
-    return Particles(transition.advance(particles.points) + draws @ factor.T, particles.log_weight)
+    points = particles.points
+    draws = normals(rng, (*points.shape[:-1], transition.noise_factor(points).shape[-1]))
+    return Particles(transition.advance(points) + transition.disturbance(points, draws), particles.log_weight)
 
 
 def update(particles: Particles, z: Array, sensor: Sensor) -> tuple[Particles, Array]:

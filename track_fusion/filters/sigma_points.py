@@ -44,7 +44,7 @@ def predict(mean: Array, cov: Array, transition: Transition, points: SigmaPoints
     origin = moved[..., :1, :]
     shift = points.mean(moved - origin)
     deviation = moved - origin - shift[..., None, :]
-    return origin[..., 0, :] + shift, symmetrise(points.cross(deviation, deviation) + transition.noise)
+    return origin[..., 0, :] + shift, symmetrise(points.cross(deviation, deviation) + transition.noise(mean))
 
 
 def expected_measurement(mean: Array, sigma: Array, sensor: Sensor, points: SigmaPoints) -> tuple[Array, Array]:

@@ -51,7 +51,7 @@ def predict(mean: Array, root: Array, transition: Transition) -> tuple[Array, Ar
     moved = transition.advance(rule.of(mean, root))
     shift = rule.mean(moved - moved[..., :1, :])
     deviation = moved - moved[..., :1, :] - shift[..., None, :]
-    return moved[..., 0, :] + shift, triangular_root(_beside(_scaled(deviation), transition.noise_factor))
+    return moved[..., 0, :] + shift, triangular_root(_beside(_scaled(deviation), transition.noise_factor(mean)))
 
 
 def update(mean: Array, root: Array, z: Array, sensor: Sensor) -> tuple[Array, Array, Innovation]:

@@ -72,7 +72,7 @@ def predict(mean: Array, cov: Array, transition: Transition) -> tuple[Array, Arr
                   smoother, 2016; Chen 2022, 5.2.
     """
     slope = transition.jacobian(mean)
-    return transition.advance(mean), symmetrise(slope @ cov @ transpose(slope) + transition.noise)
+    return transition.advance(mean), symmetrise(slope @ cov @ transpose(slope) + transition.noise(mean))
 
 
 def update(

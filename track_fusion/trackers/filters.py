@@ -142,7 +142,7 @@ def _kalman(motion: Motion, sensor: Sensor, params: Params) -> TrackFilter:
         )
 
     def move(mean: Array, cov: Array, transition: Transition) -> tuple[Array, Array]:
-        return kalman.predict(mean, cov, transition.jacobian(mean), transition.noise)
+        return kalman.predict(mean, cov, transition.jacobian(mean), transition.noise(mean))
 
     def condition(mean: Array, cov: Array, z: Array, sensor: Sensor) -> tuple[Array, Array]:
         return kalman.update(mean, cov, z, sensor.jacobian(mean), sensor.noise)[:2]

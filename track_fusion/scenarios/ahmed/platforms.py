@@ -54,9 +54,8 @@ def truths(runs: Sequence[int], seed: int, steps: int = STEPS) -> Array:
         rng = stream(seed, run, "truth")
         mode = int(rng.integers(MODES))
         for k in range(steps):
-            transition = TRANSITIONS[mode]
-            noise = transition.noise_factor @ rng.standard_normal(transition.noise_factor.shape[1])
-            row[k + 1] = transition.advance(row[k]) + noise
+            transition, factor = TRANSITIONS[mode], TRANSITIONS[mode].noise_factor(row[k])
+            row[k + 1] = transition.advance(row[k]) + factor @ rng.standard_normal(factor.shape[1])
             mode = int(np.searchsorted(np.cumsum(CHAIN[mode]), rng.random() * CHAIN[mode].sum(), side="right"))
     return states
 
