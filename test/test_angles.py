@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.stats import norm
@@ -29,6 +29,7 @@ from track_fusion.angles import (
 from track_fusion.linalg import Array
 from track_fusion.tracks import StateLayout, TrackBatch
 
+law = settings(deadline=None, derandomize=True)
 #: A position, a direction, a direction without sign.
 PERIODS = (np.inf, TURN, HALF_TURN)
 angles = st.floats(-50.0, 50.0)
@@ -60,6 +61,7 @@ def assert_same_state(a: Array, b: Array, atol: float = 1e-12) -> None:
 # Wrapping -----------------------------------------------------------------------------------------------------------
 
 
+@law
 @given(angles, st.sampled_from([HALF_TURN, TURN, 360.0, 1.0]))
 def test_a_wrapped_value_is_the_same_direction_between_the_ends(value: float, period: float) -> None:
     wrapped = float(wrap(value, period))
@@ -84,6 +86,7 @@ def test_axes_that_do_not_wrap_keep_any_value() -> None:
     assert wrap(np.zeros((0, 3)), PERIODS).shape == (0, 3)
 
 
+@law
 @given(angles, angles, turns, turns)
 def test_a_difference_is_the_short_way_whatever_the_turns(a: float, b: float, i: int, j: int) -> None:
     states = np.array([a, a, a]), np.array([b, b, b])
@@ -97,6 +100,7 @@ def test_a_difference_is_the_short_way_whatever_the_turns(a: float, b: float, i:
 # Moments ------------------------------------------------------------------------------------------------------------
 
 
+@law
 @given(components())
 def test_within_a_half_circle_moments_are_those_of_the_line(parts: tuple[Array, Array, Array]) -> None:
     wanted_mean, wanted_cov = on_the_line(*parts)
@@ -106,6 +110,7 @@ def test_within_a_half_circle_moments_are_those_of_the_line(parts: tuple[Array, 
     np.testing.assert_allclose(cov, wanted_cov, rtol=1e-12, atol=1e-12 * np.abs(wanted_cov).max())
 
 
+@law
 @given(components(), st.integers(0, 4), turns)
 def test_a_turn_more_of_one_component_changes_nothing(
     parts: tuple[Array, Array, Array], which: int, turns: int
@@ -118,6 +123,7 @@ def test_a_turn_more_of_one_component_changes_nothing(
     np.testing.assert_allclose(a[1], b[1], rtol=1e-12, atol=1e-12 * np.abs(b[1]).max())
 
 
+@law
 @given(components(widest=3.0), angles, angles)
 def test_turning_all_turns_the_mean_and_leaves_the_covariance(
     parts: tuple[Array, Array, Array], first: float, second: float
@@ -176,6 +182,7 @@ def smallest_arc(values: Array, period: float) -> float:
     return period - float(np.max(np.diff(around, append=around[0] + period)))
 
 
+@law
 @given(st.lists(angles, min_size=1, max_size=6), st.sampled_from([TURN, HALF_TURN]), st.integers(0, 5))
 def test_half_circles_by_the_widest_gap(values: list[float], period: float, which: int) -> None:
     states = np.array(values)[:, None]
@@ -206,6 +213,7 @@ def test_the_reference_is_the_heaviest_or_the_most_certain_and_the_first_of_equa
 # Interpolation ------------------------------------------------------------------------------------------------------
 
 
+@law
 @given(angles, st.floats(-1.5, 1.5), st.floats(0.0, 1.0), angles, turns)
 def test_interpolation_goes_the_short_way(start: float, gap: float, share: float, turn: float, more: int) -> None:
     begin = np.array([5.0, start, start])

@@ -10,6 +10,7 @@ import numpy as np
 
 from track_fusion.linalg import Array, asymmetric, is_positive_definite
 from track_fusion.models.base import Motion, Sensor
+from track_fusion.models.constant_turn_rate_and_speed import ConstantTurnRateAndSpeed, TurnRateAndSpeedParams
 from track_fusion.models.measurement import LinearSensor, RangeBearingSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams, KnownTurn, KnownTurnParams
@@ -45,6 +46,7 @@ MOTIONS: Mapping[str, Choice[Motion]] = {
     "nearly_constant_velocity": Choice(MotionParams, NearlyConstantVelocity),
     "coordinated_turn": Choice(CoordinatedTurnParams, CoordinatedTurn),
     "known_turn": Choice(KnownTurnParams, KnownTurn),
+    "constant_turn_rate_and_speed": Choice(TurnRateAndSpeedParams, ConstantTurnRateAndSpeed),
 }
 
 
