@@ -10,8 +10,10 @@ from scipy.optimize import linear_sum_assignment
 from benchmark.baselines import Array, association_costs_by_loop
 from benchmark.measure import Result, race
 from track_fusion.association.assignment import nearest_neighbour
-from track_fusion.centre.centre import FusionCentre, FusionCentreParams
+from track_fusion.centre.centre import FusionCentre
+from track_fusion.centre.config import CentreConfig, SourceConfig
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
+from track_fusion.rules import RULES
 from track_fusion.solvers.chi_square import chi_square_quantile
 from track_fusion.tracks import TrackBatch, planar_layout
 
@@ -66,7 +68,8 @@ def _step(count: int) -> Result:
     """One step of the centre with covariance intersection: every target seen by two sources."""
     rng, layout = np.random.default_rng(count), planar_layout()
     motion = NearlyConstantVelocity(layout, MotionParams())
-    centre = FusionCentre(2, motion, "map", FusionCentreParams())
+    rule, sources = RULES["covariance_intersection"], (SourceConfig("sensor_1"), SourceConfig("sensor_2"))
+    centre = FusionCentre(CentreConfig(sources, motion, "map", rule, rule.params()))
     mean, cov = _scene(rng, count)
     mean[:, 2:] = 0.0
     scans = [TrackBatch.gaussian(layout, "map", _seen(rng, mean, cov), cov) for _ in range(2)]

@@ -186,9 +186,7 @@ def _table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 def fusion_centre_sections() -> list[Section]:
     """List what the fusion centre declares; a test compares it with the node."""
-    from track_fusion.centre.centre import FusionCentreParams
-    from track_fusion.centre.scan_buffer import ScanBufferParams
-    from track_fusion.centre.track_manager import TrackManagerParams
+    from track_fusion.centre.config import FusionCentreParams, RuleParams, ScanBufferParams, TrackManagerParams
     from track_fusion.models.choices import MOTIONS, MotionChoice
     from track_fusion.nodes.fusion_centre import SourceParams
     from track_fusion.nodes.managed import ManagedParams
@@ -200,7 +198,7 @@ def fusion_centre_sections() -> list[Section]:
     return [
         *map(Section, (FrameParams, SourceParams, MotionChoice)),
         *_alternatives("motion", MOTIONS, MotionChoice().motion),
-        Section(FusionCentreParams),
+        *map(Section, (RuleParams, FusionCentreParams)),
         *(Section(r.params, f"{key}.", f"{r.title}: {used} {key}.") for key, r in RULES.items() if specs(r.params)),
         *map(Section, (ScanBufferParams, TrackManagerParams)),
         Section(RandomParams, title="Random numbers of rules that draw samples: seed, run and role name a stream."),

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,6 +19,30 @@ def stream(seed: int, run: int, role: str) -> np.random.Generator:
     Draw from it step by step: n draws of one step after another equal one draw of all steps.
     """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(run, zlib.crc32(role.encode()))))
+
+
+class StreamPosition(NamedTuple):
+    """Where a stream stands, as a value: the numbers of its bit generator, PCG64."""
+
+    state: int
+    increment: int
+    has_half: int
+    half: int
+
+    @classmethod
+    def of(cls, rng: np.random.Generator) -> StreamPosition:
+        """Return where a generator stands."""
+        held: Mapping[str, Any] = rng.bit_generator.state
+        return cls(held["state"]["state"], held["state"]["inc"], held["has_uint32"], held["uinteger"])
+
+    def generator(self) -> np.random.Generator:
+        """Make a generator that goes on from here."""
+        bits = np.random.PCG64(0)
+        bits.state = {
+            "bit_generator": "PCG64", "state": {"state": self.state, "inc": self.increment},
+            "has_uint32": self.has_half, "uinteger": self.half,
+        }  # fmt: skip
+        return np.random.Generator(bits)
 
 
 @dataclasses.dataclass(frozen=True)

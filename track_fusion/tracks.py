@@ -12,9 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion import angles
-from track_fusion.layout import StateLayout as StateLayout
-from track_fusion.layout import planar_layout as planar_layout
-from track_fusion.linalg import ASYMMETRY_TOLERANCE, Array, is_positive_definite, symmetrise, transpose
+from track_fusion.layouts import StateLayout as StateLayout
+from track_fusion.layouts import planar_layout as planar_layout
+from track_fusion.linalg import (
+    ASYMMETRY_TOLERANCE,
+    Array,
+    is_positive_definite,
+    is_well_conditioned,
+    symmetrise,
+    transpose,
+)
 
 #: Times are integers of nanoseconds.
 SECOND_NS = 1_000_000_000
@@ -72,12 +79,11 @@ class TrackBatch:
 
     def __post_init__(self) -> None:
         _coerce(self)
-        faults = _faults(self)
-        for reason, bad in faults.items():
+        for reason, bad in _faults(self).items():
             if bad.any():
                 first = int(np.flatnonzero(bad)[0])
                 raise ValueError(_explain(self, reason, first, int(bad.sum())))
-        object.__setattr__(self, "cov", symmetrise(self.cov))
+        _symmetrise(self)
 
     def __len__(self) -> int:
         """Return the number of tracks N."""
@@ -146,34 +152,39 @@ class TrackBatch:
         wrong += arrays.keys() - {f.name for f in fields}
         if wrong:
             raise TypeError(f"The array '{wrong[0]}' of a batch is {'unknown' if wrong[0] in arrays else 'missing'}.")
-        batch = cls._trusted(**arrays)
+        batch = object.__new__(cls)
+        vars(batch).update({"uuid": None, "phd": False} | arrays)
         _coerce(batch)
         rejected: Counter[str] = Counter()
         good = np.ones(len(batch), bool)
         for reason, bad in _faults(batch).items():
             rejected[reason] = int((bad & good).sum())
             good &= ~bad
-        object.__setattr__(batch, "cov", symmetrise(batch.cov))
+        _symmetrise(batch)
         return (batch if good.all() else batch[good]), +rejected
-
-    @classmethod
-    def _trusted(cls, **fields: Any) -> TrackBatch:
-        """Build without checks, from fields that come from a checked batch."""
-        batch = object.__new__(cls)
-        vars(batch).update(uuid=None, phd=False)
-        vars(batch).update(fields)
-        return batch
 
     def replace(self, **fields: Any) -> TrackBatch:
         """Return a batch with some arrays exchanged for computed ones of the same N; not checked again."""
         batch = object.__new__(TrackBatch)
         vars(batch).update(vars(self) | fields)
-        vars(batch).pop("moments", None)  # cached, of the arrays before
+        for cached, arrays in _CACHED.items():
+            if not arrays.isdisjoint(fields):
+                vars(batch).pop(cached, None)
+        return batch
+
+    def owned(self) -> TrackBatch:
+        """Return the batch in arrays that nobody can write to: copies, where somebody could."""
+        batch = self.replace()
+        for name in ROW_FIELDS if self.uuid is None else (*ROW_FIELDS, "uuid"):
+            array = getattr(self, name)
+            if array.flags.writeable or not array.flags.owndata:
+                vars(batch)[name] = array.copy()
+                vars(batch)[name].setflags(write=False)
         return batch
 
     def __getitem__(self, index: Any) -> TrackBatch:
         """Select tracks by a mask, an index array or a slice."""
-        rows = {f: getattr(self, f)[index] for f in _ROW_FIELDS}
+        rows = {f: getattr(self, f)[index] for f in ROW_FIELDS}
         return self.replace(**rows, uuid=None if self.uuid is None else self.uuid[index])
 
     @staticmethod
@@ -195,7 +206,7 @@ class TrackBatch:
                 )
         count = max(b.components for b in batches)
         padded = [b._padded(count) for b in batches]
-        rows = {f: np.concatenate([getattr(b, f) for b in padded]) for f in _ROW_FIELDS}
+        rows = {f: np.concatenate([getattr(b, f) for b in padded]) for f in ROW_FIELDS}
         uuid = None
         if any(b.uuid is not None for b in batches):
             blank = [np.zeros((len(b), UUID_BYTES), np.uint8) if b.uuid is None else b.uuid for b in batches]
@@ -231,8 +242,16 @@ class TrackBatch:
             return self.mean[:, 0], self.cov[:, 0]
         return angles.moments(self.weight, self.mean, self.cov, self.layout.periods)
 
+    @cached_property
+    def well_conditioned(self) -> NDArray[np.bool_]:
+        """Which components have a covariance definite by more than rounding, (N, C)."""
+        return is_well_conditioned(self.cov)
 
-_ROW_FIELDS = ("weight", "mean", "cov", "time_ns", "track_id", "source", "status", "existence", "dof")
+
+#: The arrays that have a row a track, besides uuid.
+ROW_FIELDS = ("weight", "mean", "cov", "time_ns", "track_id", "source", "status", "existence", "dof")
+#: What is worked out once, and the arrays that it is of.
+_CACHED = {"moments": {"weight", "mean", "cov"}, "well_conditioned": {"cov"}}
 _DTYPES = {"weight": np.float64, "mean": np.float64, "cov": np.float64, "time_ns": np.int64, "track_id": np.int64,
            "source": np.uint32, "status": np.uint8, "existence": np.float64, "dof": np.float64}  # fmt: skip
 
@@ -246,7 +265,7 @@ def _coerce(batch: TrackBatch) -> None:
     n, c, size = batch.mean.shape
     if size != batch.layout.size:
         raise ValueError(f"The 'mean' must have {batch.layout.size} axes, {batch.layout.axes}. Got {size}.")
-    shapes = dict.fromkeys(_ROW_FIELDS, (n,)) | {"weight": (n, c), "mean": (n, c, size), "cov": (n, c, size, size)}
+    shapes = dict.fromkeys(ROW_FIELDS, (n,)) | {"weight": (n, c), "mean": (n, c, size), "cov": (n, c, size, size)}
     for name, shape in shapes.items():
         if getattr(batch, name).shape != shape:
             raise ValueError(f"The '{name}' of a batch must have shape {shape}. Got {getattr(batch, name).shape}.")
@@ -254,6 +273,14 @@ def _coerce(batch: TrackBatch) -> None:
         object.__setattr__(batch, "uuid", np.asarray(batch.uuid, np.uint8))
         if batch.uuid.shape != (n, UUID_BYTES):
             raise ValueError(f"The 'uuid' of a batch must have shape {(n, UUID_BYTES)}. Got {batch.uuid.shape}.")
+
+
+def _symmetrise(batch: TrackBatch) -> None:
+    """Take rounding noise out of the covariances."""
+    cov = symmetrise(batch.cov)
+    if (cov != batch.cov).any():
+        object.__setattr__(batch, "cov", cov)
+        vars(batch).pop("well_conditioned", None)
 
 
 def _faults(batch: TrackBatch) -> dict[str, NDArray[np.bool_]]:
@@ -306,7 +333,7 @@ def _is_clean(batch: TrackBatch) -> bool:
         and (len(ids) == 1 or len(np.unique(ids)) == len(ids))
         and (weight.sum(1).min() > 0 if batch.phd else True)
         and (cov == transpose(cov)).all()
-        and (is_positive_definite(cov).all() if cov.any() else (weight > 0).sum(1).min() > 1)
+        and (batch.well_conditioned.all() if cov.any() else (weight > 0).sum(1).min() > 1)
     )
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from track_fusion.centre.centre import FusionCentre, FusionCentreParams
-from track_fusion.centre.track_manager import TrackManagerParams
+from track_fusion.centre.centre import FusionCentre
+from track_fusion.centre.config import CentreConfig, FusionCentreParams, SourceConfig, TrackManagerParams
 from track_fusion.filters.kalman import predict, update
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
@@ -26,10 +26,16 @@ COV = np.diag([1.0, 1.0, 0.5, 0.5])
 EAGER = TrackManagerParams(confirmation_threshold=(1, 1))
 
 
+def fusion_centre(sources, motion, rule, rule_params=None, params=None, **others):
+    names = tuple(SourceConfig(f"source_{k}") for k in range(sources))
+    params = params or FusionCentreParams()
+    return FusionCentre(CentreConfig(names, motion, "map", rule, rule_params or rule.params(), params, **others))
+
+
 def centre(sources=2, rule="covariance_intersection", rule_params=None, manager=EAGER, motion=None, **params):
-    params = FusionCentreParams(state_fusion=rule, **params)
     motion = NearlyConstantVelocity(LAYOUT, motion or MotionParams(process_noise=1.0))
-    return FusionCentre(sources, motion, "map", params, rule_params, manager)
+    params = FusionCentreParams(**params)
+    return fusion_centre(sources, motion, RULES[rule], rule_params, params, manager=manager)
 
 
 def tracks(positions, time_ns, cov=COV, **fields):
@@ -252,7 +258,8 @@ def test_a_scan_used_before_starts_nothing():
         1, max_scan_age_s=10.0, manager=TrackManagerParams(deletion_threshold=(1, 1)), publish_tentative=True
     )
     fuser.step(0, {0: tracks([[0, 0]], 0)})
-    fuser._manager._keep(np.zeros(1, bool))  # as if the track had been deleted
+    none = fuser.state.central[np.zeros(1, bool)]  # as if the track had been deleted
+    fuser.state = dataclasses.replace(fuser.state, central=none)
     fused, _ = fuser.step(SECOND, {})
     assert len(fused) == 0
 
@@ -624,8 +631,7 @@ def test_particles_of_an_earlier_scan_are_predicted_with_process_noise():
 def test_a_turning_target_is_predicted_along_its_turn():
     layout = StateLayout(("x", "y", "vx", "vy", "turn_rate"))
     motion = CoordinatedTurn(layout, CoordinatedTurnParams(process_noise=0.1, turn_rate_noise=1e-6))
-    params = FusionCentreParams(state_fusion="naive", max_scan_age_s=10.0)
-    own = FusionCentre(1, motion, "map", params, manager_params=EAGER)
+    own = fusion_centre(1, motion, RULES["naive"], params=FusionCentreParams(max_scan_age_s=10.0), manager=EAGER)
     state = np.array([[0.0, 0.0, 10.0, 0.0, np.pi / 8]])
     scan = TrackBatch.gaussian(layout, "map", state, 1e-4 * np.eye(5)[None], time_ns=SECOND)
     fused, _ = own.step(5 * SECOND, {0: scan})
@@ -638,9 +644,8 @@ def test_a_turning_target_is_predicted_along_its_turn():
 
 def test_a_rule_that_samples_goes_on_in_its_stream_and_begins_anew_after_reset():
     random = RandomParams(seed=4, run=2, role="centre")
-    params = FusionCentreParams(state_fusion="geometric_mean_sampling")
     motion = NearlyConstantVelocity(LAYOUT, MotionParams())
-    own = FusionCentre(2, motion, "map", params, manager_params=EAGER, random=random)
+    own = fusion_centre(2, motion, RULES["geometric_mean_sampling"], manager=EAGER, random=random)
     rng, rule, found = stream(4, 2, "centre"), RULES["geometric_mean_sampling"], []
     for k in (1, 2):
         scans = {0: tracks([(0, 0)], k * SECOND), 1: tracks([(1, 0)], k * SECOND, 3 * COV)}
@@ -678,7 +683,7 @@ def test_every_rule_but_one_that_joins_particles_takes_their_gaussian(rule, late
 
 def screening(batch):
     """What a reader of the batch rejects."""
-    fields = {name: value for name, value in vars(batch).items() if name != "moments"}
+    fields = {field.name: getattr(batch, field.name) for field in dataclasses.fields(batch)}
     return TrackBatch.screened(**fields)[1]
 
 
@@ -778,8 +783,8 @@ def failing(how):
 
 @pytest.mark.parametrize("how", ["not finite", "no covariance", "error"])
 def test_a_fusion_without_a_density_harms_no_other_target(how):
-    params, motion = FusionCentreParams(), NearlyConstantVelocity(LAYOUT, MotionParams())
-    own = FusionCentre(3, motion, "map", params, manager_params=EAGER, rule=failing(how))
+    motion = NearlyConstantVelocity(LAYOUT, MotionParams())
+    own = fusion_centre(3, motion, failing(how), manager=EAGER)
     good = centre(3, rule="naive", motion=MotionParams())
     near, far = (0, 0), (2000, 0)
     for k in range(3):

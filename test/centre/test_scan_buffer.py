@@ -1,11 +1,17 @@
 """When a step runs and what belongs to it: every policy, every reason, any order of arrival."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from track_fusion.centre.scan_buffer import ScanBuffer, ScanBufferParams
+from track_fusion.centre import buffer as functions
+from track_fusion.centre.buffer import ScanBuffer
+from track_fusion.centre.config import CentreConfig, ScanBufferParams, SourceConfig
+from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
+from track_fusion.rules import RULES
 from track_fusion.tracks import TrackBatch, planar_layout
 
 MS = 10**6
@@ -19,8 +25,35 @@ def scan(*ids):
     )
 
 
+class Held:
+    """Holds a buffer, a value, from call to call."""
+
+    def __init__(self, assembles, params):
+        sources = tuple(SourceConfig(str(k), assembles=a) for k, a in enumerate(assembles))
+        motion, rule = NearlyConstantVelocity(LAYOUT, MotionParams()), RULES["naive"]
+        self.config = CentreConfig(sources, motion, "map", rule, rule.params(), buffer=params)
+        self.reset()
+
+    def reset(self):
+        self.value = ScanBuffer.empty(self.config)
+
+    def add(self, source, scan, stamp_ns, now_ns):
+        self.value, reason = functions.add(self.config, self.value, source, scan, stamp_ns, now_ns)
+        return reason
+
+    def pop(self, now_ns, living=False):
+        self.value, step = functions.advance(self.config, self.value, now_ns, living)
+        return step
+
+    def silent_since(self, source, now_ns):
+        return self.value.silence_s(source, now_ns)
+
+    def all_silent(self, now_ns):
+        return functions.all_silent(self.config, self.value, now_ns)
+
+
 def buffer(sources=2, assembles=(), **params):
-    return ScanBuffer([k in assembles for k in range(sources)], ScanBufferParams(**params))
+    return Held([k in assembles for k in range(sources)], ScanBufferParams(**params))
 
 
 def add(buf, source, stamp_ms, now_ms, *ids):
@@ -220,6 +253,50 @@ def test_forgets_everything_when_the_clock_jumps_back():
     assert steps(buf, 200)[0] == (100, {0: [100], 1: [1]})
 
 
+def test_when_all_are_silent_a_step_without_scans_runs_while_tracks_live():
+    buf = buffer(source_timeout_s=1.0)
+    assert buf.pop(10_000 * MS, living=True) is None  # nothing was ever heard
+    add(buf, 0, 5000, 5000)
+    add(buf, 1, 5000, 5000)
+    assert steps(buf, 5000) == [(5000, {0: [5000], 1: [15_000]})]
+    for now, living, time in [(5999, True, None), (6000, False, None), (6010, True, 6010), (7009, True, None),
+                              (7010, True, 7010)]:  # fmt: skip
+        step = buf.pop(now * MS, living)
+        assert step == (None if time is None else (time * MS, {}, {}))
+    add(buf, 1, 7500, 7500)
+    assert times(buf, 7600) == [7500]
+    assert buf.pop(8499 * MS, living=True) is None
+    assert buf.pop(8500 * MS, living=True) == (8500 * MS, {}, {})
+
+
+@pytest.mark.parametrize("assembling", [False, True])
+def test_no_function_changes_the_buffer_it_is_given(assembling):
+    """Whatever was done with a buffer since, doing the same to it again gives the same."""
+    buf, kept = buffer(2, assembles=(1,) if assembling else (), source_timeout_s=0.3, fusion_timeout_s=0.05), []
+
+    def told(value):
+        return (
+            value.fused_ns,
+            [(q.newest_ns, q.heard_ns, [(*w[:2], w.scan.track_id.tolist()) for w in q.waiting]) for q in value.queues],
+        )
+
+    for now, what in [(100, (0, 100, 7)), (100, (1, 100, 5)), (101, (1, 100, 6)), (102, (0, 100, 7)), (103, None),
+                      (120, (1, 110, 5)), (130, (0, 110, 7)), (150, None), (200, None), (600, None)]:  # fmt: skip
+        before = buf.value
+        if what is None:
+            action = partial(functions.advance, buf.config, before, now * MS, True)
+        else:
+            source, stamp, track_id = what
+            action = partial(functions.add, buf.config, before, source, scan(track_id), stamp * MS, now * MS)
+        buf.value, outcome = action()
+        kept.append((before, told(before), action, told(buf.value), repr(outcome)))
+    assert sum("scans={}" in outcome for *_, outcome in kept) == 1
+    for before, content, action, after, outcome in kept:
+        assert told(before) == content
+        value, again = action()
+        assert (told(value), repr(again)) == (after, outcome)
+
+
 @st.composite
 def arrivals(draw):
     """Stamps of one to four sources, each in order, and an order of arrival across them."""
@@ -232,7 +309,7 @@ def arrivals(draw):
 def test_any_order_of_arrival_across_sources_gives_the_same_steps(arrived, assembling):
     """Every stamp is a step, at once or when the sources fall silent, and holds all scans of its time."""
     stamps, turns = arrived
-    buf = ScanBuffer([assembling] * len(stamps), ScanBufferParams(source_timeout_s=5.0, fusion_timeout_s=5.0))
+    buf = Held([assembling] * len(stamps), ScanBufferParams(source_timeout_s=5.0, fusion_timeout_s=5.0))
     queues, found = [list(s) for s in stamps], []
     for now, k in enumerate(turns):
         add(buf, k, queues[k].pop(0), 13 + now)

@@ -3,8 +3,13 @@
 import numpy as np
 import pytest
 
-from track_fusion.centre.track_manager import TrackManager, TrackManagerParams
+from track_fusion.centre.config import CentreConfig, SourceConfig, TrackManagerParams
+from track_fusion.centre.fuse import Fused
+from track_fusion.centre.manage import manage
+from track_fusion.centre.state import CentralTracks
+from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.params import ParameterError
+from track_fusion.rules import RULES
 from track_fusion.tracks import COASTED, CONFIRMED, TrackBatch, planar_layout
 
 SECOND = 10**9
@@ -12,27 +17,32 @@ LAYOUT = planar_layout()
 
 
 class Life:
-    """Drives a manager by hand: one call a step, naming which sources delivered and which tracks each supports."""
+    """Manages by hand: one call a step, naming which sources delivered and which tracks each supports."""
 
     def __init__(self, sources=2, **params):
-        self.manager = TrackManager(sources, LAYOUT, "map", TrackManagerParams(**params))
-        self.sources, self.time = sources, 0
+        names = tuple(SourceConfig(str(k)) for k in range(sources))
+        motion, rule = NearlyConstantVelocity(LAYOUT, MotionParams()), RULES["naive"]
+        self.central = CentralTracks.none(CentreConfig(names, motion, "map", rule, rule.params()))
+        self.params, self.sources, self.time = TrackManagerParams(**params), sources, 0
 
     def step(self, fresh, members, births=0, dt_s=0.1):
         """`members`: for each living track, then each newborn, the set of sources with a member in it."""
         self.time += round(dt_s * SECOND)
-        count = len(self.manager.tracks) + births
+        count = len(self.central) + births
         assert len(members) == count
         fused = TrackBatch.gaussian(
             LAYOUT, "map", np.zeros((count, 4)), np.tile(np.eye(4), (count, 1, 1)), time_ns=self.time
         )
         member = np.array([[k in m for k in range(self.sources)] for m in members], bool).reshape(count, self.sources)
         supported = np.array([self.time if m else -1 for m in members], np.int64)
-        return self.manager.commit(fused, member, np.isin(np.arange(self.sources), list(fresh)), supported)
+        fresh = np.isin(np.arange(self.sources), list(fresh))
+        fused = Fused(fused, np.ones((count, 4), bool))
+        self.central, changes = manage(self.params, self.central, fused, member, fresh, supported)
+        return changes
 
     @property
     def status(self):
-        return dict(zip(self.manager.tracks.track_id.tolist(), self.manager.tracks.status.tolist(), strict=True))
+        return dict(zip(self.central.tracks.track_id.tolist(), self.central.tracks.status.tolist(), strict=True))
 
 
 def test_two_of_three_confirm_for_good():
@@ -145,7 +155,7 @@ def test_identifiers_count_up_and_are_never_used_again():
     assert life.step({0}, [set(), {0}]).deleted.tolist() == [1]
     assert life.step({0}, [set()]).deleted.tolist() == [2]
     assert life.step({0}, [{0}, {0}], births=2).born.tolist() == [3, 4]
-    assert life.manager.tracks.track_id.tolist() == [3, 4]
+    assert life.central.tracks.track_id.tolist() == [3, 4]
 
 
 def test_a_deletion_leaves_the_others_their_history():

@@ -15,13 +15,29 @@ from typing import Any
 import numpy as np
 import pytest
 from nav_msgs.msg import Odometry
-from nodes.support import PATIENT, START_S, STEP_S, clock, deep, read, stamp_ns
+from nodes.support import AXES, PATIENT, START_S, STEP_S, clock, deep, read, stamp_ns
 from rclpy.parameter import Parameter
+from rclpy.serialization import deserialize_message
 from ros_helpers import NodeProcess, Probe
+from rosbags.rosbag2 import Reader
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
+from msg_adapters.odometry import odometry_from_msg
+from msg_adapters.track_table import track_table_to_msg
+from track_fusion.centre.centre import FusionCentre
+from track_fusion.centre.config import (
+    CentreConfig,
+    FusionCentreParams,
+    ScanBufferParams,
+    SourceConfig,
+    TrackManagerParams,
+)
+from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.nodes.recorder import Recorder
+from track_fusion.params import specs
+from track_fusion.rules import RULES as FUSION_RULES
+from track_fusion.tracks import StateLayout, TrackBatch
 
 ROOT = Path(__file__).resolve().parents[2]
 GOLDEN = ROOT / "test" / "data" / "golden"
@@ -134,6 +150,41 @@ def test_a_recording_replayed_gives_the_same_to_the_last_bit(storage: str, fused
     compare(tables[storage], RECORDINGS[storage])
     first, again = ([m.data.tobytes() for m in tables[name]] for name in (RECORDINGS[storage], storage))
     assert first == again
+
+
+def library_centre(oracle: str) -> FusionCentre:
+    """Return the library's centre with the parameters of `centre`."""
+    given = PATIENT | expected(oracle)["parameters"]
+    sources = tuple(SourceConfig(name, assembles=oracle == "odometry") for name in SOURCES)
+
+    def read_as(kind: Any, prefix: str = "") -> Any:
+        return kind(**{name: given[prefix + name] for name in specs(kind) if prefix + name in given})
+
+    rule = FUSION_RULES[given["state_fusion"]]
+    motion = NearlyConstantVelocity(StateLayout(tuple(given["layout"])), read_as(MotionParams))
+    kinds = FusionCentreParams, TrackManagerParams, ScanBufferParams
+    return FusionCentre(
+        CentreConfig(sources, motion, "map", rule, read_as(rule.params, f"{rule.key}."), *map(read_as, kinds))
+    )
+
+
+@pytest.mark.parametrize("name", [*RULES, "odometry"])
+def test_a_library_user_gets_what_the_node_publishes_to_the_last_bit(name: str, fused: Any) -> None:
+    """The same bag fed by hand, with the stamps for a clock, and at last a clock that runs on."""
+    own, published, stamp = library_centre(name), [], 0
+    with Reader(GOLDEN / ("odometry" if name == "odometry" else "tracks")) as bag:
+        for connection, _, raw in bag.messages():
+            msg = deserialize_message(raw, TYPES["odometry" if name == "odometry" else "tracks"][0])
+            arrays = odometry_from_msg(msg, AXES).tracks if name == "odometry" else read(msg)
+            fields = {field: value for field, value in vars(arrays).items() if field != "axes"}
+            scan, stamp = TrackBatch.screened(layout=StateLayout(arrays.axes), **fields)[0], stamp_ns(msg)
+            source = SOURCES.index(connection.topic.split("/")[1])
+            assert own.receive(source, scan, stamp, stamp) is None
+            published += own.advance(stamp)
+    published += own.advance(stamp + int(2e9 * PATIENT["fusion_timeout_s"]))
+    tables = [track_table_to_msg(result.tracks, AXES, result.time_ns).data.tobytes() for result in published]
+    assert tables == [msg.data.tobytes() for msg in fused[0][name]]
+    assert [result.time_ns for result in published] == [stamp_ns(msg) for msg in fused[0][name]]
 
 
 def test_identities_do_not_switch(fused: Any) -> None:

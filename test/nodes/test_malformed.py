@@ -39,11 +39,12 @@ from msg_adapters.detection_table import detection_table_from_msg, detection_tab
 from msg_adapters.header import stamp_from_ns
 from msg_adapters.odometry import odometry_from_msg, odometry_to_msgs
 from msg_adapters.track_table import track_table_to_msg
-from track_fusion.centre.centre import FusionCentre, FusionCentreParams
-from track_fusion.centre.track_manager import TrackManagerParams
+from track_fusion.centre.centre import FusionCentre
+from track_fusion.centre.config import CentreConfig, SourceConfig, TrackManagerParams
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.params import Params
+from track_fusion.rules import RULES
 from track_fusion.trackers.filters import TRACK_FILTERS
 from track_fusion.trackers.one_target import SensorTracker, SensorTrackerParams
 from track_fusion.tracks import StateLayout, TrackBatch, planar_layout
@@ -246,8 +247,9 @@ def bench(shared_domain: int, shared_probe: Probe) -> Iterator[Bench]:
 
 def reference(sources: int) -> FusionCentre:
     """The library's centre with the parameters of the nodes."""
-    params = FusionCentreParams(state_fusion="covariance_intersection")
-    return FusionCentre(sources, MOTION, "map", params, manager_params=MANAGER)
+    rule, names = RULES["covariance_intersection"], map(str, range(sources))
+    config = CentreConfig(tuple(map(SourceConfig, names)), MOTION, "map", rule, rule.params(), manager=MANAGER)
+    return FusionCentre(config)
 
 
 def library_batch(arrays: Any) -> TrackBatch:

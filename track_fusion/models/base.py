@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from track_fusion.layout import StateLayout
+from track_fusion.layouts import StateLayout
 from track_fusion.linalg import Array, matvec
 
 

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from track_fusion.angles import TURN, difference, periods_of
-from track_fusion.layout import StateLayout
+from track_fusion.layouts import StateLayout
 from track_fusion.linalg import Array
 
 #: Distances are not taken shorter than this when dividing by them: at the sensor itself derivatives are zero.

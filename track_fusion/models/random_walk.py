@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from track_fusion.layout import StateLayout
+from track_fusion.layouts import StateLayout
 from track_fusion.linalg import Array
 from track_fusion.params import ParameterError, param
 

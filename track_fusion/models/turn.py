@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from track_fusion.layout import StateLayout
+from track_fusion.layouts import StateLayout
 from track_fusion.linalg import Array
 from track_fusion.models.base import Transition
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity

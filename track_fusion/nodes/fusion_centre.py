@@ -17,9 +17,17 @@ from msg_adapters.header import check_header
 from msg_adapters.markers import markers_to_msg
 from msg_adapters.odometry import CrossBlock, odometry_from_msg, odometry_to_msgs
 from msg_adapters.track_table import track_table_from_msg, track_table_to_msg
-from track_fusion.centre.centre import FusionCentre, FusionCentreParams, StepInfo
-from track_fusion.centre.scan_buffer import ScanBuffer, ScanBufferParams
-from track_fusion.centre.track_manager import TrackManagerParams
+from track_fusion.centre.centre import FusionCentre
+from track_fusion.centre.config import (
+    MAX_SOURCES,
+    CentreConfig,
+    FusionCentreParams,
+    RuleParams,
+    ScanBufferParams,
+    SourceConfig,
+    TrackManagerParams,
+)
+from track_fusion.centre.publish import StepInfo
 from track_fusion.models.choices import MOTIONS, MotionChoice
 from track_fusion.nodes.managed import ManagedNode, end, run
 from track_fusion.nodes.ros_params import chosen, declare
@@ -27,10 +35,8 @@ from track_fusion.nodes.screening import FrameParams, screened_tracks
 from track_fusion.params import ParameterError, Params, param
 from track_fusion.random_streams import RandomParams
 from track_fusion.rules import RULES
-from track_fusion.tracks import SECOND_NS, StateLayout, TrackBatch
+from track_fusion.tracks import StateLayout, TrackBatch
 
-#: Provenance has 32 bits.
-MAX_SOURCES = 32
 #: How often waiting scans and silent sources are looked at, in ROS time.
 LOOK_PERIOD_S = 0.02
 
@@ -76,20 +82,22 @@ class SourceParams(Params):
 
 
 class FusionCentreNode(ManagedNode):
-    """Carries messages to a :class:`track_fusion.centre.centre.FusionCentre`; steps as the scan buffer says."""
+    """Carries messages and the time to a :class:`track_fusion.centre.centre.FusionCentre`."""
 
     def declare_parameters_(self) -> None:
         """Declare parameters and build the centre."""
         self.frame, self.sources = declare(self, FrameParams), declare(self, SourceParams)
         motion = chosen(self, MOTIONS, declare(self, MotionChoice).motion, StateLayout(self.frame.axes))
-        params = declare(self, FusionCentreParams)
-        rule_params = {key: declare(self, rule.params, f"{key}.") for key, rule in RULES.items()}
+        rule = RULES[declare(self, RuleParams).state_fusion]
+        rule_params = {key: declare(self, each.params, f"{key}.") for key, each in RULES.items()}
+        names = zip(self.sources.source_configurations, self.sources.kinds, strict=True)
+        sources = tuple(SourceConfig(name, assembles=kind == "odometry") for name, kind in names)
         self.centre = FusionCentre(
-            len(self.sources.source_configurations), motion, self.frame.frame_id, params,
-            rule_params[params.state_fusion], declare(self, TrackManagerParams), random=declare(self, RandomParams),
+            CentreConfig(
+                sources, motion, self.frame.frame_id, rule, rule_params[rule.key], declare(self, FusionCentreParams),
+                declare(self, TrackManagerParams), declare(self, ScanBufferParams), declare(self, RandomParams),
+            )
         )  # fmt: skip
-        self._buffer_params = declare(self, ScanBufferParams)
-        self.buffer = ScanBuffer([k == "odometry" for k in self.sources.kinds], self._buffer_params)
         self._latency_s = 0.0
         self._last: StepInfo | None = None
 
@@ -109,7 +117,7 @@ class FusionCentreNode(ManagedNode):
         """Say what it does: a parameter file for another node's name would go unnoticed."""
         names = self.sources.source_configurations
         sources = ", ".join(self.resolve_topic_name(f"~/sources/{name}/tracks") for name in names)
-        what = f"{' '.join(self.frame.axes)} in frame '{self.frame.frame_id}' by {self.centre.params.state_fusion}"
+        what = f"{' '.join(self.frame.axes)} in frame '{self.frame.frame_id}' by {self.centre.config.rule.key}"
         self.log.info(f"Fusing {what} from {sources}.")
 
     def _on_lost(self, event: Any) -> None:
@@ -124,59 +132,48 @@ class FusionCentreNode(ManagedNode):
                 msg.header, frame_id=self.frame.frame_id, now_ns=now, max_future_ns=self.frame.max_future_ns
             )
             arrays = track_table_from_msg(msg) if kind == "track_table" else self._read_odometry(msg)
-            self._take(source, screened_tracks(self, arrays, self.centre.layout), stamp_ns, now)
+            self._take(source, screened_tracks(self, arrays, self.centre.config.layout), stamp_ns, now)
 
         return read
 
     def _read_odometry(self, msg: Any) -> TrackArrays:
         cross_block: CrossBlock = "conservative" if self.sources.cross_block == "conservative" else "block_diagonal"
-        reading = odometry_from_msg(msg, self.centre.layout.axes, cross_block)
+        reading = odometry_from_msg(msg, self.centre.config.layout.axes, cross_block)
         self.counted["cross_block_absent"] += reading.cross_block_absent
         return reading.tracks
 
     def _take(self, source: int, scan: TrackBatch, stamp_ns: int, now_ns: int) -> None:
-        reason = self.buffer.add(source, scan, stamp_ns, max(now_ns, stamp_ns))
-        if reason:
+        now_ns = max(now_ns, stamp_ns)
+        if reason := self.centre.receive(source, scan, stamp_ns, now_ns):
             name = self.sources.source_configurations[source]
             self.reject({reason: 1}, f"a scan of {name} stamped {stamp_ns / 1e9:.3f} s")
             return
-        self._advance(max(now_ns, stamp_ns))
+        self._advance(now_ns)
 
     def _on_timer(self) -> None:
         if self.active and self.released:
-            self._handle(self._look_at, self.now_ns())
-
-    def _look_at(self, now: int) -> None:
-        """Fuse what has waited long enough; when all sources are silent, let the tracks coast."""
-        self._advance(now)
-        idle = now - self.buffer.fused_ns >= self._buffer_params.source_timeout_s * SECOND_NS
-        if idle and len(self.centre.tracks) and self.buffer.all_silent(now):
-            self.buffer.fused_ns = now
-            self._step(now, {})
+            self._handle(self._advance, self.now_ns())
 
     def on_clock_jump(self) -> None:
         """Forget all tracks and waiting scans."""
-        self.buffer.reset()
         self.centre.reset()
 
     def _advance(self, now_ns: int) -> None:
-        while (ready := self.buffer.pop(now_ns)) is not None:
-            time_ns, scans, superseded = ready
-            self.reject(superseded, "a newer scan of the source came before its fusion")
-            self._step(time_ns, scans)
-
-    def _step(self, time_ns: int, scans: dict[int, TrackBatch]) -> None:
+        """Publish what is due by now."""
         began = time.perf_counter()
-        fused, self._last = self.centre.step(time_ns, scans)
-        self._publish(fused, time_ns)
-        self._latency_s = time.perf_counter() - began
-        self.counted["steps"] += 1
-        self.counted["unconverged"] += self._last.unconverged
-        self.counted["unsound"] += self._last.unsound
-        self.counted["deleted"] += len(self._last.changes.deleted)
+        for result in self.centre.advance(now_ns):
+            self.reject(result.superseded, "a newer scan of the source came before its fusion")
+            self._publish(result.tracks, result.time_ns)
+            self._latency_s = time.perf_counter() - began
+            self._last = result.info
+            self.counted["steps"] += 1
+            self.counted["unconverged"] += result.info.unconverged
+            self.counted["unsound"] += result.info.unsound
+            self.counted["deleted"] += len(result.info.changes.deleted)
+            began = time.perf_counter()
 
     def _publish(self, fused: TrackBatch, stamp_ns: int) -> None:
-        axes = self.centre.layout.axes
+        axes = self.centre.config.layout.axes
         self._tracks.publish(track_table_to_msg(fused, axes, stamp_ns))
         if self._odometry.get_subscription_count():
             for msg in odometry_to_msgs(fused, axes):
@@ -187,19 +184,20 @@ class FusionCentreNode(ManagedNode):
     def diagnose(self) -> tuple[list[str], dict[str, Any]]:
         """Report each source's silence, tracks, latency; warn of silent sources and double counting."""
         warnings = []
-        values: dict[str, Any] = {"rule": self.centre.rule.key, "tracks": len(self.centre.tracks)}
+        rule, timeout_s = self.centre.config.rule, self.centre.config.buffer.source_timeout_s
+        values: dict[str, Any] = {"rule": rule.key, "tracks": len(self.centre.tracks)}
         values["step_s"] = round(self._latency_s, 6)
         for k, name in enumerate(self.sources.source_configurations):
-            silence = self.buffer.silent_since(k, self.now_ns())
+            silence = self.centre.silence_s(k, self.now_ns())
             values[f"silence_s/{name}"] = round(silence, 3)
-            if silence >= self._buffer_params.source_timeout_s:
+            if silence >= timeout_s:
                 warnings.append(f"{name} is silent for {silence:.1f} s")
         if unsound := self.counted["unsound"]:
             warnings.append(f"{unsound} fusions gave no density; a single source was taken instead")
         if self._last is not None:
             values["members"] = self._last.members.tolist()
-            if self._last.shared_provenance and self.centre.rule.guarantee != "conservative":
-                warnings.append(f"{self.centre.rule.key} counts information twice: its members hold each other's")
+            if self._last.shared_provenance and rule.guarantee != "conservative":
+                warnings.append(f"{rule.key} counts information twice: its members hold each other's")
         return warnings, values
 
 

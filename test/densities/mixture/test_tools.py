@@ -9,15 +9,8 @@ from scipy import integrate
 from scipy.optimize import minimize
 
 from track_fusion.densities.gaussian import kl_divergence
-from track_fusion.densities.mixture.mixture import (
-    Factored,
-    Mixture,
-    divergence,
-    extraction,
-    log_pdf,
-    moments,
-    reduction,
-)
+from track_fusion.densities.mixture import divergence, extraction, reduction
+from track_fusion.densities.mixture.mixture import Factored, Mixture, log_pdf, moments
 from track_fusion.linalg import Array
 
 

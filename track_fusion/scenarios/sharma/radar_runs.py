@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.association.assignment import nearest_pairs
-from track_fusion.centre.centre import FusionCentre, FusionCentreParams
-from track_fusion.centre.track_manager import TrackManagerParams
+from track_fusion.centre.centre import FusionCentre
+from track_fusion.centre.config import CentreConfig, FusionCentreParams, SourceConfig, TrackManagerParams
 from track_fusion.linalg import Array
 from track_fusion.metrics.consistency import nees
 from track_fusion.models.geodetic import LocalFrame
@@ -144,9 +144,9 @@ def local_tracks(seed: int, run: int, progress: Progress) -> Iterator[tuple[int,
 
 def centre(choice: RuleChoice) -> FusionCentre:
     """Return the fusion centre, with memory, that fuses by this rule."""
-    return FusionCentre(
-        len(RADARS), MOTION, FRAME, FusionCentreParams(memory=True), choice.params, MANAGER, RULES[choice.key]
-    )
+    sources = tuple(map(SourceConfig, RADARS))
+    rule, params = RULES[choice.key], FusionCentreParams(memory=True)
+    return FusionCentre(CentreConfig(sources, MOTION, FRAME, rule, choice.params, params, MANAGER))
 
 
 #: What is kept of each target at a fusion, NaN where it is lost, and of the fusion.

@@ -1,0 +1,244 @@
+"""What a fusion centre is told before the first scan: its sources, motion, rule and thresholds, checked at once."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from track_fusion.linalg import Array
+from track_fusion.models.base import Motion
+from track_fusion.models.transforms import Transform
+from track_fusion.params import ParameterError, Params, param
+from track_fusion.random_streams import RandomParams
+from track_fusion.rules import RULES, Rule, SourceTracks
+from track_fusion.solvers.chi_square import chi_square_quantile
+from track_fusion.tracks import StateLayout
+
+#: Provenance has 32 bits.
+MAX_SOURCES = 32
+#: Updates that a history remembers: its width in bits.
+HISTORY_BITS = 32
+
+
+@dataclasses.dataclass(frozen=True)
+class RuleParams(Params):
+    """How tracks are fused."""
+
+    state_fusion: str = param("covariance_intersection", "the fusion rule", choices=tuple(RULES))
+
+
+@dataclasses.dataclass(frozen=True)
+class FusionCentreParams(Params):
+    """What takes part in a fusion and how it is associated."""
+
+    association: str = param(
+        "nearest",
+        "nearest: global nearest neighbour within the gate; single_target: all sources are known to track one and the "
+        "same target, so that the first track of each is taken without a gate",
+        choices=("nearest", "single_target"),
+    )
+    gate_probability: float = param(
+        0.99,
+        "share of true pairs of tracks inside the gate (chi-square over all axes)",
+        low=0.0,
+        high=1.0 - 1e-12,
+        strict=True,
+    )
+    max_scan_age_s: float = param(
+        0.5, "a source's newest scan takes part, predicted, until it is older than this", unit="s", low=0.0
+    )
+    fuse_confirmed_only: bool = param(True, "leave tentative source tracks out")
+    fuse_coasted: bool = param(True, "let coasted source tracks take part")
+    memory: bool = param(
+        False,
+        "fuse the central track's own prediction, too, before the sources' tracks, and each scan only once; what is "
+        "published stays conservative only by a rule that is so for every cross-correlation",
+    )
+    publish_tentative: bool = param(False, "publish central tracks before they are confirmed, too")
+    particle_variances: tuple[float, ...] = param(
+        (),
+        "added to the variances of particles taken as one Gaussian, one number an axis, SI units squared: particles "
+        "that have collapsed onto a few points have a singular covariance",
+        low=0.0,
+        kind=float,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class ScanBufferParams(Params):
+    """When a fusion step runs and which scans are too late for it."""
+
+    trigger: str = param(
+        "all_sources",
+        "all_sources: fuse once every live source has delivered a scan of that time or later; "
+        "any_source: fuse at every scan",
+        choices=("all_sources", "any_source"),
+    )
+    fusion_timeout_s: float = param(0.1, "how long a scan waits for the other sources", unit="s", low=0.0)
+    source_timeout_s: float = param(
+        1.0,
+        "after this silence a source is not waited for; when all are silent, tracks coast",
+        unit="s",
+        low=0.0,
+        strict=True,
+    )
+    max_delay_s: float = param(10.0, "a scan older than this on arrival is rejected", unit="s", low=0.0, strict=True)
+    out_of_sequence: str = param(
+        "predict",
+        "a scan older than the last fusion: neglect it, or keep it as its source's newest and predict it from then on",
+        choices=("neglect", "predict"),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class TrackManagerParams(Params):
+    """Thresholds of a central track's life, counted per update of a source."""
+
+    confirmation_threshold: tuple[int, ...] = param(
+        (2, 3), "[M, N]: confirm a track with M hits in the last N updates of one source", low=1, high=HISTORY_BITS
+    )
+    deletion_threshold: tuple[int, ...] = param(
+        (5, 5),
+        "[P, Q]: delete a track that every source that ever hit it missed in P of its last Q updates",
+        low=1,
+        high=HISTORY_BITS,
+    )
+    max_coast_s: float = param(
+        5.0, "delete a track that no source supported for so long", unit="s", low=0.0, strict=True
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("confirmation_threshold", "deletion_threshold"):
+            value = getattr(self, name)
+            if len(value) != 2 or value[0] > value[1]:
+                raise ParameterError(f"The '{name}' parameter must be two integers, the first not larger. Got {value}.")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SourceConfig:
+    """What is known of a source of tracks.
+
+    Attributes
+    ----------
+    name : str
+    assembles : bool               its scans arrive piece by piece (one message a track), so that a scan is complete
+                                   only when a later one has begun
+    transform : Transform or None  from its axes and frame to the centre's; None = it has those of the centre
+    """
+
+    name: str
+    assembles: bool = False
+    transform: Transform | None = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CentreConfig:
+    """A fusion centre of S sources, all but its state.
+
+    Attributes
+    ----------
+    sources : tuple of SourceConfig    in the order in which a rule gets their tracks; scans name them by index
+    motion : Motion                    predicts source and central tracks; its layout is the centre's, n axes
+    frame_id : str                     frame of the central tracks
+    rule : Rule                        one that needs only tracks
+    rule_params : Params               of that rule
+    params : FusionCentreParams
+    manager : TrackManagerParams
+    buffer : ScanBufferParams
+    random : RandomParams              what rules that sample draw from, step after step
+
+    Raises
+    ------
+    ParameterError    too many sources; the rule needs what source tracks do not bring, such as their
+                      cross-covariance; weights are given that do not fit the sources; not one number an axis in
+                      `particle_variances`; a transform does not bring every axis of the centre
+    """
+
+    sources: tuple[SourceConfig, ...]
+    motion: Motion
+    frame_id: str
+    rule: Rule
+    rule_params: Params
+    params: FusionCentreParams = FusionCentreParams()
+    manager: TrackManagerParams = TrackManagerParams()
+    buffer: ScanBufferParams = ScanBufferParams()
+    random: RandomParams = RandomParams(role="fusion_centre")
+
+    def __post_init__(self) -> None:
+        if len(self.sources) > MAX_SOURCES:
+            raise ParameterError(f"The 'sources' must be at most {MAX_SOURCES}. Got {len(self.sources)}.")
+        needed = sorted(set(self.rule.needed(self.rule_params)) - {"seed"})
+        if needed:
+            raise ParameterError(
+                f"The 'state_fusion' parameter must be a rule that needs only tracks. Got '{self.rule.key}', "
+                f"which at these parameters needs {', '.join(needed)}: use it in the library or by track-fusion fuse."
+            )
+        if len(self.params.particle_variances) not in (0, self.layout.size):
+            raise ParameterError(
+                f"The 'particle_variances' parameter must hold {self.layout.size} numbers, one an axis, or none. "
+                f"Got {len(self.params.particle_variances)}."
+            )
+        if len(self.weights) or getattr(self.rule_params, "criterion", "") == "given":
+            self._try_weights()
+        for source in self.sources:
+            self._check_transform(source)
+
+    def _try_weights(self) -> None:
+        """Refuse weights that the rule would refuse when every source has a track: see it on equal ones."""
+        count, n = len(self.sources) + self.params.memory, self.layout.size
+        if count == 1:
+            return
+        equal = SourceTracks(np.zeros((1, count, n)), np.tile(np.eye(n), (1, count, 1, 1)))
+        try:
+            self.rule.fuse(equal, self.rule_params)
+        except ValueError as error:
+            what = "one a source, the central track first" if self.params.memory else "one a source"
+            raise ParameterError(
+                f"The parameters of the rule '{self.rule.key}' do not fit {count} tracks, {what}: {error}"
+            ) from None
+
+    def _check_transform(self, source: SourceConfig) -> None:
+        if source.transform is None:
+            return
+        shape, rank = source.transform.matrix.shape, int(np.linalg.matrix_rank(source.transform.matrix))
+        if shape[0] != self.layout.size or rank < self.layout.size:
+            raise ParameterError(
+                f"The 'transform' of the source '{source.name}' must bring every axis of the centre, "
+                f"{', '.join(self.layout.axes)}. Got a matrix of shape {shape} and rank {rank}."
+            )
+
+    @property
+    def layout(self) -> StateLayout:
+        """The n axes of the central tracks."""
+        return self.motion.layout
+
+    @cached_property
+    def gamma(self) -> float:
+        """The gate: a quantile of chi-square with n degrees of freedom."""
+        return chi_square_quantile(self.params.gate_probability, self.layout.size)
+
+    @cached_property
+    def floor(self) -> Array:
+        """What is added to the covariance of particles, (n, n)."""
+        return np.diag(self.params.particle_variances or np.zeros(self.layout.size))
+
+    @cached_property
+    def weights(self) -> Array:
+        """Fusion weights given to the rule, the central track's first with memory; empty: it finds its own."""
+        return np.array(getattr(self.rule_params, "weights", ()), float)
+
+    @cached_property
+    def brings(self) -> NDArray[np.bool_]:
+        """Which axes of the centre each source brings, (S, n)."""
+        every = np.ones(self.layout.size, bool)
+        rows = [every if s.transform is None else s.transform.brings for s in self.sources]
+        return np.array(rows, bool).reshape(-1, self.layout.size)
+
+    @cached_property
+    def draws(self) -> bool:
+        """Whether the rule draws random numbers."""
+        return "seed" in (*self.rule.needed(self.rule_params), *self.rule.optional)

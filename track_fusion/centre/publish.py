@@ -1,0 +1,49 @@
+"""Stage 8 of a step: what readers get, and what happened."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from track_fusion.centre.associate import Association
+from track_fusion.centre.config import FusionCentreParams
+from track_fusion.centre.fuse import Fused
+from track_fusion.centre.manage import Changes
+from track_fusion.centre.pool import Pool
+from track_fusion.tracks import TrackBatch
+
+
+@dataclasses.dataclass(frozen=True)
+class StepInfo:
+    """What happened in a step.
+
+    Attributes
+    ----------
+    members : (S,) int          source tracks that took part, by source
+    changes : Changes           births, confirmations, deletions
+    shared_provenance : int     members that already hold another one's information: source tracks that say so, and
+                                with memory each central track that was fused with new ones
+    unconverged : int           fusions whose weights did not converge
+    unsound : int               fusions whose result was no density, so that a single member was taken instead
+    """
+
+    members: NDArray[np.intp]
+    changes: Changes
+    shared_provenance: int
+    unconverged: int
+    unsound: int
+
+
+def publish(params: FusionCentreParams, tracks: TrackBatch) -> TrackBatch:
+    """Return those of the central tracks that are published."""
+    return tracks if params.publish_tentative or tracks.is_confirmed.all() else tracks[tracks.is_confirmed]
+
+
+def told(sources: int, pool: Pool, association: Association, fused: Fused, changes: Changes) -> StepInfo:
+    """Sum up a step of a centre of so many sources."""
+    member = association.member
+    foreign = int(np.count_nonzero(pool.tracks.source[member] & ~pool.bit[member]))
+    taken = np.bincount(pool.source[member], minlength=sources)
+    return StepInfo(taken, changes, foreign + len(association.remembered), fused.unconverged, fused.unsound)

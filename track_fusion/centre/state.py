@@ -1,0 +1,100 @@
+"""The state of a fusion centre, a value: nothing in it changes, a step makes another one."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from track_fusion.centre.config import CentreConfig
+from track_fusion.random_streams import StreamPosition
+from track_fusion.tracks import ROW_FIELDS, TrackBatch
+
+Bools = NDArray[np.bool_]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CentralTracks:
+    """The T central tracks in the order of their identifiers, and what the S sources did for each.
+
+    Attributes
+    ----------
+    tracks : TrackBatch      all living ones, tentative ones included
+    has : (T, n) bool        which axes each really has
+    history : (T, S)         one bit an update of the source, the newest the lowest, hit = 1
+    updates : (T, S)         how many updates there were since birth
+    hit_ever : (T, S)        whether there was a hit
+    supported_ns : (T,)      stamp of the scan of the last member
+    next_id : int            identifier of the next newborn
+    """
+
+    tracks: TrackBatch
+    has: Bools
+    history: NDArray[np.uint32]
+    updates: NDArray[np.int64]
+    hit_ever: Bools
+    supported_ns: NDArray[np.int64]
+    next_id: int = 1
+
+    @classmethod
+    def none(cls, config: CentreConfig) -> CentralTracks:
+        """No tracks yet."""
+        shape = 0, len(config.sources)
+        return cls(
+            TrackBatch.empty(config.layout, config.frame_id), np.zeros((0, config.layout.size), bool),
+            np.zeros(shape, np.uint32), np.zeros(shape, np.int64), np.zeros(shape, bool), np.zeros(0, np.int64),
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        """Return the number of tracks T."""
+        return len(self.tracks)
+
+    def __getitem__(self, rows: Bools) -> CentralTracks:
+        """Select tracks by a mask."""
+        return CentralTracks(
+            self.tracks[rows], self.has[rows], self.history[rows], self.updates[rows], self.hit_ever[rows],
+            self.supported_ns[rows], self.next_id,
+        )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CentreState:
+    """All that a step needs of those before it; its arrays refuse writing, and it can be pickled.
+
+    Attributes
+    ----------
+    central : CentralTracks
+    newest : tuple of TrackBatch or None    newest scan of each source, in the centre's axes and frame
+    random : StreamPosition or None         where the stream of a rule that draws stands
+    time_ns : int                           of the last step, -1 before the first
+    """
+
+    central: CentralTracks
+    newest: tuple[TrackBatch | None, ...]
+    random: StreamPosition | None = None
+    time_ns: int = -1
+
+    @classmethod
+    def initial(cls, config: CentreConfig) -> CentreState:
+        """Nothing known yet."""
+        random = StreamPosition.of(config.random.stream()) if config.draws else None
+        return cls(CentralTracks.none(config), (None,) * len(config.sources), random)
+
+    def __post_init__(self) -> None:
+        for array in self._arrays():
+            array.setflags(write=False)
+
+    def _arrays(self) -> Iterator[NDArray[Any]]:
+        own = self.central
+        yield from (own.has, own.history, own.updates, own.hit_ever, own.supported_ns)
+        for tracks in (own.tracks, *self.newest):
+            if tracks is not None:
+                yield from (getattr(tracks, name) for name in ROW_FIELDS)
+
+    def __setstate__(self, fields: Mapping[str, Any]) -> None:
+        """Take what was pickled; NumPy forgets that it must not be written to."""
+        vars(self).update(fields)
+        self.__post_init__()

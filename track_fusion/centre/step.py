@@ -1,0 +1,56 @@
+"""One step of a fusion centre, a pure function of its state; doc/fusion-centre.md states each stage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from track_fusion.centre.associate import associate
+from track_fusion.centre.config import CentreConfig
+from track_fusion.centre.fuse import fuse
+from track_fusion.centre.manage import manage
+from track_fusion.centre.pool import Pool, admitted
+from track_fusion.centre.publish import StepInfo, publish, told
+from track_fusion.centre.state import CentreState
+from track_fusion.tracks import TrackBatch
+
+
+def step(
+    config: CentreConfig, state: CentreState, time_ns: int, scans: Mapping[int, TrackBatch]
+) -> tuple[CentreState, TrackBatch, StepInfo]:
+    """Fuse at one time; equal arguments give equal results, bit for bit.
+
+    Parameters
+    ----------
+    config : CentreConfig
+    state : CentreState                the one before; it stays as it is
+    time_ns : int                      fusion time, not before that of the last step
+    scans : {source: TrackBatch}       new scans, stamped at or before `time_ns`, in their source's axes and frame
+
+    Returns
+    -------
+    CentreState
+    TrackBatch     the tracks to publish, all at `time_ns`
+    StepInfo
+
+    Raises
+    ------
+    ValueError    a scan does not fit, or time goes back
+    """
+    if time_ns < state.time_ns:
+        raise ValueError(f"The 'time_ns' of a step must not be before the last one, {state.time_ns}. Got {time_ns}.")
+    sources, before = len(config.sources), state.central
+    newest = admitted(config, state.newest, time_ns, scans)
+    fresh = np.zeros(sources, bool)
+    fresh[list(scans)] = True
+    pool = Pool.of(config, newest, before, fresh, time_ns)
+    association = associate(config, pool, fresh)
+    fused, random = fuse(config, pool, association, state.random)
+    member = np.zeros((len(fused.tracks), sources), bool)
+    member[association.target, pool.source[association.member]] = True
+    supported_ns = np.full(len(fused.tracks), -1, np.int64)
+    np.maximum.at(supported_ns, association.target, pool.stamp_ns[association.member])
+    central, changes = manage(config.manager, before, fused, member, fresh, supported_ns)
+    info = told(sources, pool, association, fused, changes)
+    return CentreState(central, newest, random, time_ns), publish(config.params, central.tracks), info
