@@ -4,14 +4,17 @@ VENV := .venv/bin/python
 STAGES ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test bench lint docs clean
+.PHONY: help venv demo test test-all rest bench lint docs clean
+.NOTPARALLEL:
 
 help:
 	@echo 'track_fusion: track-to-track fusion for ROS 2 Jazzy'
 	@echo
 	@echo '  make demo    run the published scenario over ROS 2: a table, a bag and a picture in out/demo/'
-	@echo '  make test    linters, the whole suite, colcon, the oldest NumPy and SciPy, a bare environment'
+	@echo '  make test    linters and the suite, on the oldest NumPy and SciPy, too: minutes'
 	@echo '               (some stages only: make test STAGES="lint suite")'
+	@echo '  make test-all    that, then what is slow or needs more: the rest with the oldest versions, colcon,'
+	@echo '               a bare environment'
 	@echo '  make lint    the linters alone: ruff and mypy'
 	@echo '  make bench   measure speed and print ratios'
 	@echo '  make docs    write the pages and parameter files that are made from the code'
@@ -29,10 +32,15 @@ demo: venv
 	@.venv/bin/track-fusion demo
 
 test: venv
-	@$(VENV) tools/run_tests.py $(STAGES)
+	@$(VENV) -m tools.run_tests $(STAGES)
+
+test-all: test rest
+
+rest: venv
+	@$(VENV) -m tools.run_tests --rest
 
 lint: venv
-	@$(VENV) tools/run_tests.py lint
+	@$(VENV) -m tools.run_tests lint
 
 docs: venv
 	@$(VENV) -m tools.docs

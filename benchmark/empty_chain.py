@@ -11,7 +11,7 @@ import numpy as np
 
 from msg_adapters.track_table import track_table_to_msg
 from track_fusion.nodes.fusion_centre import FusionCentreNode
-from track_fusion.nodes.managed import end, run
+from track_fusion.nodes.process import end, run
 from track_fusion.nodes.sensor_tracker import SensorTrackerNode
 from track_fusion.tracks import TrackBatch, planar_layout
 

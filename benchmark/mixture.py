@@ -16,7 +16,7 @@ from track_fusion.densities.mixture.proposals import (
     inflated_naive,
     laplace_proposal,
 )
-from track_fusion.densities.mixture.quotient import exact_quotient, wep_quotient
+from track_fusion.densities.mixture.quotient import exact_quotient, laplace, wep_quotient
 from track_fusion.densities.mixture.reduction import runnalls
 from track_fusion.densities.mixture.sampling import optimise_omega, single_shot_em
 
@@ -63,7 +63,7 @@ def _fusion() -> Iterator[Result]:
 
     def exact_igs() -> object:
         quotient = exact_quotient(first, second, common)
-        return indirect_global_sampling(quotient, laplace_proposal(quotient), np.random.default_rng(0), 1000)
+        return indirect_global_sampling(quotient, laplace_proposal(laplace(quotient)), np.random.default_rng(0), 1000)
 
     def exact_dls() -> object:
         quotient = exact_quotient(first, second, common)

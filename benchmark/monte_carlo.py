@@ -8,7 +8,8 @@ import numpy as np
 
 from benchmark.baselines import two_filters_and_intersection_looped
 from benchmark.measure import Result, race
-from track_fusion.scenarios.li2022.linear import RULE_CHOICES, TRACKING, fused_filters
+from track_fusion.scenarios.li2022.linear import RULE_CHOICES, TRACKING, kalman_row
+from track_fusion.study.one_target import drawn
 
 RUNS = 1000
 #: The loop is timed on so many runs and scaled up.
@@ -17,9 +18,7 @@ SAMPLE = 3
 
 def run() -> Iterator[Result]:
     """Measure the rows of covariance intersection, measurements given: two filters, the rule, feedback."""
-    truth = TRACKING.truths(1, range(RUNS))
-    drawn = [TRACKING.measurements(states, 1, run) for run, states in enumerate(truth)]
-    seen = [np.stack([d[name] for d in drawn]) for name in TRACKING.sensors]
+    draws = drawn(TRACKING, range(RUNS), 1)
     sensors, motion = list(TRACKING.sensors.values()), TRACKING.motion.matrices(TRACKING.dt_s)
     for choice in RULE_CHOICES:
         if choice.key != "covariance_intersection":
@@ -27,12 +26,12 @@ def run() -> Iterator[Result]:
         weight = 0.5 if choice.variant == "uniform" else None
 
         def study(choice=choice):
-            return [fused.mean for fused in fused_filters(choice, seen)]
+            return [fused.mean for fused in kalman_row(choice).estimates(draws)]
 
         def loop(weight=weight):
             return two_filters_and_intersection_looped(
                 TRACKING.initial_mean, TRACKING.initial_cov, *motion,
-                sensors[0].matrix, [s.noise for s in sensors], [z[:SAMPLE] for z in seen], weight,
+                sensors[0].matrix, [s.noise for s in sensors], [z[:SAMPLE] for z in draws.seen], weight,
             )  # fmt: skip
 
         _check(study(), loop(), weight)

@@ -16,17 +16,14 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown, Time
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
+from track_fusion.demo.wiring import Bringup, bringups
+
 PACKAGE = "track_fusion"
-FUSED = "/fusion_centre/tracks"
 END_S = 1.0  # from the end of the replay to that of the rest: the last messages are still to be read
-# Nodes that are no trackers.
-OTHERS = ("fusion_centre", "evaluator", "replay")
-# Launch arguments that override a parameter of the file: argument, node, parameter, type. The seed goes to trackers
-# that draw random numbers, too.
+# Launch arguments that override a parameter of the file: argument, node, parameter, type.
 OVERRIDES = (
     ("rule", "fusion_centre", "state_fusion", str),
     ("seed", "replay", "seed", int),
-    ("seed", "fusion_centre", "seed", int),
     ("pace", "replay", "pace", str),
     ("rate", "replay", "rate", float),
 )
@@ -60,67 +57,39 @@ def generate_launch_description():
 
 def scenario_nodes(context):
     """Build the nodes that the scenario's parameter file names."""
-    parameter_file = find_parameter_file(LaunchConfiguration("scenario").perform(context))
-    names = yaml.safe_load(parameter_file.read_text())
-    sensors = [name for name in names if name not in OTHERS]
-    drawing = [s for s in sensors if names[s]["ros__parameters"].get("filter") == "particle"]
-    overrides = (*OVERRIDES, *(("seed", sensor, "seed", int) for sensor in drawing))
-    remappings = {
-        "replay": [("~/fused", FUSED)],
-        "fusion_centre": [(f"~/sources/{sensor}/tracks", f"/{sensor}/tracks") for sensor in sensors],
-        "evaluator": [("~/truth", "/replay/truth"), ("~/tracks", FUSED)],
-    }
-    for sensor in sensors:
-        remappings[sensor] = [("~/detections", f"/replay/{sensor}/detections"), ("~/feedback", FUSED)]
+    scenario, folder = LaunchConfiguration("scenario").perform(context), Path(get_package_share_directory(PACKAGE))
+    known = bringups(folder / "config")
+    if scenario not in known:
+        raise RuntimeError(f"There is no scenario '{scenario}'. There are: {', '.join(known)}.")
+    given = {}
+    for argument, owner, parameter, kind in OVERRIDES:
+        if text := LaunchConfiguration(argument).perform(context):
+            given.setdefault(owner, {})[parameter] = kind(text)
+    return [node(spec) for spec in Bringup(scenario, folder / "config").nodes(given)]
+
+
+def node(spec):
+    """Build one node; the launch ends with the replay."""
     over = TimerAction(period=END_S, actions=[Shutdown(reason="the replay is over")])
-    # Replay comes last: by then the others are starting already.
-    return [
-        node(
-            name,
-            [str(parameter_file), *override_file(context, name, overrides)],
-            remappings[name],
-            **({"on_exit": [over]} if name == "replay" else {}),
-        )
-        for name in (*sensors, *OTHERS)
-    ]
-
-
-def node(name, parameters, remappings, **options):
-    """Build one node; its executable is its name, but for the sensors' trackers."""
     return Node(
         package=PACKAGE,
-        executable=name if name in OTHERS else "sensor_tracker",
-        name=name,
-        parameters=parameters,
-        remappings=remappings,
+        executable=spec.executable,
+        name=spec.name,
+        parameters=[str(spec.parameter_file), *override_file(spec)],
+        remappings=list(spec.remaps.items()),
         output="screen",
-        **options,
+        **({"on_exit": [over]} if spec.name == "replay" else {}),
     )
 
 
-def override_file(context, name, overrides):
-    """Write the launch arguments given for one node to a parameter file of its own.
+def override_file(spec):
+    """Write what stands on top of the parameter file to a file of its own.
 
     launch would do the same with a dictionary, but for all nodes ("/**"), and what the first file says of this node
     would win over that when it has a section for all nodes, too.
     """
-    given = {}
-    for argument, owner, parameter, kind in overrides:
-        text = LaunchConfiguration(argument).perform(context)
-        if owner == name and text:
-            given[parameter] = kind(text)
-    if not given:
+    if not spec.params:
         return []
-    with NamedTemporaryFile("w", prefix=f"{name}_", suffix=".yaml", delete=False) as file:
-        yaml.safe_dump({name: {"ros__parameters": given}}, file)
+    with NamedTemporaryFile("w", prefix=f"{spec.name}_", suffix=".yaml", delete=False) as file:
+        yaml.safe_dump({spec.name: {"ros__parameters": dict(spec.params)}}, file)
     return [file.name]
-
-
-def find_parameter_file(scenario):
-    """Return the path of config/<scenario>.yaml; when there is none, say which there are."""
-    folder = Path(get_package_share_directory(PACKAGE)) / "config"
-    path = folder / f"{scenario}.yaml"
-    if path.is_file():
-        return path
-    known = [other.stem for other in sorted(folder.glob("*.yaml")) if "replay" in yaml.safe_load(other.read_text())]
-    raise RuntimeError(f"There is no scenario '{scenario}'. There are: {', '.join(known)}.")

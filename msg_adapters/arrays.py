@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+#: What stands for a position-velocity block that a message cannot carry: none, or a bound of every possible one.
+CrossBlock = Literal["block_diagonal", "conservative"]
 
 
 class MessageError(ValueError):
@@ -29,62 +31,50 @@ class TrackLike(Protocol):
     @property
     def frame_id(self) -> str:
         """Frame of every state."""
-        ...
 
     @property
     def weight(self) -> Floats:
         """Mixture weights (N, C)."""
-        ...
 
     @property
     def mean(self) -> Floats:
         """Means (N, C, n)."""
-        ...
 
     @property
     def cov(self) -> Floats:
         """Covariances (N, C, n, n)."""
-        ...
 
     @property
     def time_ns(self) -> NDArray[np.int64]:
         """Times of validity (N,), ns."""
-        ...
 
     @property
     def track_id(self) -> NDArray[np.int64]:
         """Identities (N,)."""
-        ...
 
     @property
     def source(self) -> NDArray[np.uint32]:
         """Provenance bits (N,)."""
-        ...
 
     @property
     def status(self) -> NDArray[np.uint8]:
         """Status bits (N,)."""
-        ...
 
     @property
     def existence(self) -> Floats:
         """Existence probabilities (N,)."""
-        ...
 
     @property
     def dof(self) -> Floats:
         """Degrees of freedom (N,), inf = Gaussian."""
-        ...
 
     @property
     def uuid(self) -> NDArray[np.uint8] | None:
         """Global identities (N, 16), or None."""
-        ...
 
     @property
     def phd(self) -> bool:
         """Whether weights need not sum to 1."""
-        ...
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -109,6 +99,37 @@ class TrackArrays:
     dof: Floats
     uuid: NDArray[np.uint8] | None = None
     phd: bool = False
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """All but the axes, by name: what a TrackBatch takes beside its layout."""
+        return {name: value for name, value in vars(self).items() if name != "axes"}
+
+
+def slots_of(axes: Sequence[str], slots: Mapping[str, int], message: str) -> NDArray[np.intp]:
+    """Return where a message has the axes.
+
+    Raises
+    ------
+    MessageError    `missing_axis`: it has no place for one, or there is none
+    """
+    missing = [a for a in axes if a not in slots]
+    if missing or not axes:
+        got = ", ".join(missing) or "none"
+        raise MessageError("missing_axis", f"The axes of {message} must be of {', '.join(slots)}. Got {got}.")
+    return np.array([slots[a] for a in axes])
+
+
+def one_track(
+    axes: tuple[str, ...], frame_id: str, mean: Floats, cov: Floats, *, time_ns: int, track_id: int, status: int
+) -> TrackArrays:
+    """Make the arrays of one certain Gaussian track from mean (n,) and cov (n, n)."""
+    return TrackArrays(
+        axes=axes, frame_id=frame_id, weight=np.ones((1, 1)), mean=mean[None, None], cov=cov[None, None],
+        time_ns=np.array([time_ns], np.int64), track_id=np.array([track_id], np.int64),
+        source=np.zeros(1, np.uint32), status=np.array([status], np.uint8),
+        existence=np.ones(1), dof=np.full(1, np.inf),
+    )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

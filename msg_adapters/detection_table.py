@@ -2,26 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from functools import lru_cache
 
 from sensor_msgs.msg import PointCloud2
 
-from msg_adapters._table import (
-    PLANS,
-    Block,
-    Fields,
-    Layout,
-    Rows,
-    Signature,
-    cov_name,
-    make_layout,
-    new_cloud,
-    signature,
-    upper_pairs,
-    upper_triangle,
-)
+from msg_adapters._table import PLANS, cov_name, upper_pairs
+from msg_adapters._table_reading import Block, Fields, Rows, Signature, signature
+from msg_adapters._table_writing import make_layout, new_cloud, upper_triangle
 from msg_adapters.arrays import DetectionArrays
 from msg_adapters.header import stamp_to_ns
 
@@ -43,7 +31,7 @@ def detection_table_to_msg(detections: DetectionArrays) -> PointCloud2:
             f"The 'value' must have shape (N, {len(axes)}) for {axes}, and 'cov' (N, {len(axes)}, {len(axes)}). "
             f"Got {value.shape} and {None if cov is None else cov.shape}."
         )
-    layout = _layout(tuple(axes), cov is not None)
+    layout = make_layout((), tuple(axes), with_cov=cov is not None)
     msg, rows = new_cloud(layout, len(value), detections.time_ns, detections.frame_id)
     rows["mean"] = value
     if cov is not None:
@@ -68,30 +56,18 @@ def detection_table_from_msg(msg: PointCloud2, axes: Sequence[str]) -> Detection
     MessageError    `missing_field` (a covariance which is given in part included), `bad_field`,
                     `wrong_data_length`
     """
-    plan = _plan(signature(msg), tuple(axes))
+    of_value, of_cov = _plan(signature(msg), tuple(axes))
     rows = Rows(msg)
-    value = rows.matrix(plan.value)
-    cov = None if plan.cov is None else rows.matrix(plan.cov).reshape(rows.count, len(axes), len(axes))
+    value = rows.matrix(of_value)
+    cov = None if of_cov is None else rows.matrix(of_cov).reshape(rows.count, len(axes), len(axes))
     return DetectionArrays(tuple(axes), msg.header.frame_id, stamp_to_ns(msg.header.stamp), value, cov)
 
 
 @lru_cache(maxsize=PLANS)
-def _layout(axes: tuple[str, ...], with_cov: bool) -> Layout:
-    return make_layout([], axes, with_cov)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Plan:
-    """Where the wanted fields stand."""
-
-    value: Block
-    cov: Block | None
-
-
-@lru_cache(maxsize=PLANS)
-def _plan(sig: Signature, axes: tuple[str, ...]) -> _Plan:
+def _plan(sig: Signature, axes: tuple[str, ...]) -> tuple[Block, Block | None]:
+    """Find where the axes stand, and their covariance."""
     fields = Fields(sig)
     fields.require(axes, " of a detection table")
     names = (n for a, b in upper_pairs(axes) for n in (cov_name(a, b), cov_name(b, a)))
     some = any(n in fields for n in names)
-    return _Plan(fields.block(axes), fields.covariance(axes, " (covariance of the axes)") if some else None)
+    return fields.block(axes), fields.covariance(axes, " (covariance of the axes)") if some else None

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from builtin_interfaces.msg import Duration
 from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
-from std_msgs.msg import ColorRGBA, Header
+from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from msg_adapters.arrays import Floats, TrackLike, merged
 from msg_adapters.header import NS_PER_S, make_header
+from msg_adapters.orientation import from_matrix
 
 _CONFIRMED, _COASTED = 1, 2
 #: Red, green, blue, opacity.
@@ -59,58 +60,38 @@ def markers_to_msg(
     drawn = np.flatnonzero(np.isfinite(mean).all(1) & np.isfinite(cov).all((1, 2)))
     position, spread = _picked(axes, ("x", "y", "z"), mean[drawn], cov[drawn])
     velocity, _ = _picked(axes, ("vx", "vy", "vz"), mean[drawn], cov[drawn])
-    scale, quaternion = _ellipsoids(spread, sigmas, flat="z" not in axes)
+    scale, orientation = _ellipsoids(spread, sigmas, flat="z" not in axes)
     moves = "vx" in axes and "vy" in axes
     life = Duration(sec=int(lifetime_s), nanosec=int(lifetime_s % 1 * NS_PER_S))
+    shape = Marker.SPHERE if "z" in axes else Marker.CYLINDER
     for k, row in enumerate(drawn.tolist()):
-        color = _color(int(tracks.status[row]))
-        here = position[k].tolist()
-        pen = _Pen(header, namespace, row, color, life)
-        out.append(pen.ellipsoid(here, scale[k].tolist(), quaternion[k], flat="z" not in axes))
-        if moves:
-            out.append(pen.arrow(here, (position[k] + horizon_s * velocity[k]).tolist()))
-        out.append(pen.text(here, str(tracks.track_id[row])))
-    return MarkerArray(markers=out)
-
-
-class _Pen:
-    """Makes the markers of one track, which share header, number, colour and lifetime."""
-
-    def __init__(
-        self, header: Header, prefix: str, number: int, color: tuple[float, float, float, float], life: Duration
-    ) -> None:
-        self._header, self._prefix, self._number, self._life = header, prefix, number, life
-        self._color = color
-
-    def _marker(self, kind: int, name: str, scale: list[float], pose: Pose, opaque: bool = True) -> Marker:
-        r, g, b, a = self._color
         # Numbered by row, not by track id: ids have 32 bits, a marker's number 31; all are deleted each time.
-        return Marker(
-            header=self._header, ns=self._prefix + name, id=self._number, type=kind, action=Marker.ADD, pose=pose,
-            scale=Vector3(x=scale[0], y=scale[1], z=scale[2]), lifetime=self._life,
-            color=ColorRGBA(r=r, g=g, b=b, a=1.0 if opaque else a),
+        mark = partial(Marker, header=header, id=row, action=Marker.ADD, lifetime=life)
+        r, g, b, a = _color(int(tracks.status[row]))
+        here, color = position[k].tolist(), ColorRGBA(r=r, g=g, b=b, a=1.0)
+        ellipsoid = Pose(position=_point(here), orientation=orientation[k])
+        out.append(
+            mark(ns=f"{namespace}covariance", type=shape, pose=ellipsoid, scale=_vector(scale[k].tolist()),
+                 color=ColorRGBA(r=r, g=g, b=b, a=a))
         )  # fmt: skip
-
-    def ellipsoid(self, at: list[float], scale: list[float], quaternion: list[float], flat: bool) -> Marker:
-        x, y, z, w = quaternion
-        pose = Pose(position=_point(at), orientation=Quaternion(x=x, y=y, z=z, w=w))
-        return self._marker(Marker.CYLINDER if flat else Marker.SPHERE, "covariance", scale, pose, opaque=False)
-
-    def arrow(self, start: list[float], tip: list[float]) -> Marker:
-        marker = self._marker(Marker.ARROW, "velocity", [_SHAFT_M, _HEAD_M, 0.0], Pose())
-        marker.points = [_point(start), _point(tip)]
-        return marker
-
-    def text(self, at: list[float], text: str) -> Marker:
-        marker = self._marker(
-            Marker.TEXT_VIEW_FACING, "id", [0.0, 0.0, _TEXT_M], Pose(position=_point([at[0], at[1], at[2] + _TEXT_M]))
+        if moves:
+            arrow = [_point(here), _point((position[k] + horizon_s * velocity[k]).tolist())]
+            size = _vector([_SHAFT_M, _HEAD_M, 0.0])
+            out.append(mark(ns=f"{namespace}velocity", type=Marker.ARROW, points=arrow, scale=size, color=color))
+        above, size = Pose(position=_point([*here[:2], here[2] + _TEXT_M])), _vector([0.0, 0.0, _TEXT_M])
+        name = str(tracks.track_id[row])
+        out.append(
+            mark(ns=f"{namespace}id", type=Marker.TEXT_VIEW_FACING, pose=above, scale=size, color=color, text=name)
         )
-        marker.text = text
-        return marker
+    return MarkerArray(markers=out)
 
 
 def _point(at: list[float]) -> Point:
     return Point(x=at[0], y=at[1], z=at[2])
+
+
+def _vector(size: list[float]) -> Vector3:
+    return Vector3(x=size[0], y=size[1], z=size[2])
 
 
 def _color(status: int) -> tuple[float, float, float, float]:
@@ -129,8 +110,8 @@ def _picked(axes: Sequence[str], wanted: tuple[str, str, str], mean: Floats, cov
     return out_mean, out_cov
 
 
-def _ellipsoids(cov: Floats, sigmas: float, flat: bool) -> tuple[Floats, list[list[float]]]:
-    """Return full lengths of the axes (N, 3), m, and orientations (x, y, z, w) of covariances (N, 3, 3)."""
+def _ellipsoids(cov: Floats, sigmas: float, flat: bool) -> tuple[Floats, list[Quaternion]]:
+    """Return full lengths of the axes (N, 3), m, and orientations of covariances (N, 3, 3)."""
     size = 2 if flat else 3
     values, vectors = np.linalg.eigh(cov[:, :size, :size])
     scale = np.full((len(cov), 3), _THIN_M)
@@ -139,19 +120,4 @@ def _ellipsoids(cov: Floats, sigmas: float, flat: bool) -> tuple[Floats, list[li
     turn[:, 2, 2] = 1.0
     turn[:, :size, :size] = vectors
     turn[:, :, 0] *= np.sign(np.linalg.det(turn))[:, None]  # eigenvectors may be a reflection
-    return scale, [_quaternion(r) for r in turn.tolist()]
-
-
-def _quaternion(r: list[list[float]]) -> list[float]:
-    """Return (x, y, z, w) of a rotation matrix, by its largest component, which no cancellation spoils."""
-    trace = r[0][0] + r[1][1] + r[2][2]
-    squared = [1 + 2 * r[0][0] - trace, 1 + 2 * r[1][1] - trace, 1 + 2 * r[2][2] - trace, 1 + trace]
-    big = max(range(4), key=squared.__getitem__)
-    s = math.sqrt(squared[big]) * 2
-    if big == 3:
-        return [(r[2][1] - r[1][2]) / s, (r[0][2] - r[2][0]) / s, (r[1][0] - r[0][1]) / s, s / 4]
-    i, j, k = big, (big + 1) % 3, (big + 2) % 3
-    out = [0.0] * 4
-    out[i], out[3] = s / 4, (r[k][j] - r[j][k]) / s
-    out[j], out[k] = (r[j][i] + r[i][j]) / s, (r[k][i] + r[i][k]) / s
-    return out
+    return scale, [from_matrix(r) for r in turn.tolist()]

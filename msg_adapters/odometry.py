@@ -14,11 +14,12 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from geometry_msgs.msg import Point, Pose, PoseWithCovariance, Quaternion, Twist, TwistWithCovariance, Vector3
+from geometry_msgs.msg import Point, Pose, PoseWithCovariance, Twist, TwistWithCovariance, Vector3
 from nav_msgs.msg import Odometry
 
-from msg_adapters.arrays import Floats, MessageError, TrackArrays, TrackLike, merged
+from msg_adapters.arrays import CrossBlock, Floats, MessageError, TrackArrays, TrackLike, merged, one_track, slots_of
 from msg_adapters.header import make_header, stamp_to_ns
+from msg_adapters.orientation import from_yaw, rotation_matrix, unit_quaternion, yaw_of, yaw_rotations
 
 #: Where an axis stands in the message: 0 to 5 the pose, 6 to 11 the twist.
 _SLOT = {"x": 0, "y": 1, "z": 2, "yaw": 5, "vx": 6, "vy": 7, "vz": 8, "turn_rate": 11}
@@ -27,13 +28,9 @@ _SIZE = 12
 #: Variance (SI units squared) of what a track does not say, such as z of a track in the plane. Zero would
 #: say "certain": robot_localization takes a zero variance for an oversight and puts 1e-6 in its place.
 UNOBSERVED_VARIANCE = 1e6
-#: How far the squared norm of a quaternion may be from 1; beyond, it is no orientation but an oversight.
-QUATERNION_TOLERANCE = 1e-2
 #: "42", "track_42", "robot_1/track_42", "track42"; but not the last digits of a hexadecimal name.
 _NUMBERED = re.compile(r"(?:.*[_/#:.\-])?[A-Za-z]*?([0-9]+)", re.ASCII | re.DOTALL)
 _MAX_ID = 2**32 - 1
-
-CrossBlock = Literal["block_diagonal", "conservative"]
 
 
 class OdometryReading(NamedTuple):
@@ -83,7 +80,7 @@ def odometry_to_msgs(
     cov[:, slots[:, None], slots] = track_cov[:, np.array(have)[:, None], have]
     yaw = mean[:, _SLOT["yaw"]]
     if "yaw" in axes:
-        mean, cov = _turned(mean, cov, _yaw_rotation(-yaw))
+        mean, cov = _turned(mean, cov, yaw_rotations(-yaw))
     names = [f"{child_prefix}{i}" for i in tracks.track_id.tolist()]
     stamps = tracks.time_ns.tolist()
     return [
@@ -134,32 +131,16 @@ def odometry_from_msg(
 
     Notes
     -----
-    `conservative` bounds the joint covariance for every admissible cross block. With A the pose block,
-    B the twist block, 0 < w < 1, and any C for which J = [[A, C], [C', B]] is positive semidefinite,
-
-        D = [[A / w, 0], [0, B / (1 - w)]] >= J.
-
-    Proof. For a vector (u, v), let a = u'Au, b = v'Bv, c = u'Cv. J >= 0 gives c^2 <= a b, applied to
-    (s u, t v) for all s and t. Then (u, v)'(D - J)(u, v) = a (1/w - 1) + b (1/(1-w) - 1) - 2 c, and
-    since 1/w - 1 = (1-w)/w =: r and 1/(1-w) - 1 = 1/r, this is
-
-        a r + b / r - 2 c >= 2 sqrt(a b) - 2 |c| >= 0,
-
-    the first step being (sqrt(a r) - sqrt(b / r))^2 >= 0. It is tight: where c = sqrt(a b) and
-    a r = b / r, D - J is singular, so that for no direction can both blocks be inflated less at this w.
-    At w = 1/2 both blocks double. The twist is turned first; that changes neither A nor the claim.
+    `conservative`: with A the pose block, B the twist block, 0 < w < 1, and any C for which [[A, C], [C', B]] is
+    positive semidefinite, [[A / w, 0], [0, B / (1 - w)]] is no smaller, and at this w no smaller blocks will do: the
+    proof is in doc/wire-format.md. At w = 1/2 both double. The twist is turned first; that changes neither A nor the
+    claim.
     """
     _check_parameters(cross_block, cross_weight, twist_frame)
-    missing = [a for a in axes if a not in _SLOT]
-    if missing or not axes:
-        raise MessageError(
-            "missing_axis",
-            f"The axes of an Odometry message must be of {', '.join(_SLOT)}. Got {', '.join(missing) or 'none'}.",
-        )
+    slots = slots_of(axes, _SLOT, "an Odometry message")
     if not msg.child_frame_id:
         raise MessageError("missing_child_frame", "The child_frame_id must name the track. Got an empty one.")
     mean, cov = _state(msg, needs_orientation="yaw" in axes)
-    slots = np.array([_SLOT[a] for a in axes])
     in_twist = slots >= _TWIST.start
     if twist_frame == "child" and in_twist.any():
         mean, cov = _to_parent(msg, mean, cov)
@@ -191,18 +172,6 @@ def track_id_of(name: str, prefix: str | None = None) -> int:
     return zlib.crc32(name.encode())
 
 
-def one_track(
-    axes: tuple[str, ...], frame_id: str, mean: Floats, cov: Floats, *, time_ns: int, track_id: int, status: int
-) -> TrackArrays:
-    """Make the arrays of one certain Gaussian track from mean (n,) and cov (n, n)."""
-    return TrackArrays(
-        axes=axes, frame_id=frame_id, weight=np.ones((1, 1)), mean=mean[None, None], cov=cov[None, None],
-        time_ns=np.array([time_ns], np.int64), track_id=np.array([track_id], np.int64),
-        source=np.zeros(1, np.uint32), status=np.array([status], np.uint8),
-        existence=np.ones(1), dof=np.full(1, np.inf),
-    )  # fmt: skip
-
-
 def _check_parameters(cross_block: str, cross_weight: float, twist_frame: str) -> None:
     if cross_block not in ("block_diagonal", "conservative"):
         raise ValueError(f"The 'cross_block' must be 'block_diagonal' or 'conservative'. Got {cross_block!r}.")
@@ -214,10 +183,7 @@ def _check_parameters(cross_block: str, cross_weight: float, twist_frame: str) -
 
 def _message(frame: str, child: str, stamp_ns: int, mean: list[float], cov: Floats, yaw: float) -> Odometry:
     """Build one message from a full state, the twist in the body frame."""
-    pose = Pose(
-        position=Point(x=mean[0], y=mean[1], z=mean[2]),
-        orientation=Quaternion(x=0.0, y=0.0, z=float(np.sin(yaw / 2)), w=float(np.cos(yaw / 2))),
-    )
+    pose = Pose(position=Point(x=mean[0], y=mean[1], z=mean[2]), orientation=from_yaw(yaw))
     twist = Twist(linear=Vector3(x=mean[6], y=mean[7], z=mean[8]), angular=Vector3(x=mean[9], y=mean[10], z=mean[11]))
     # Contiguous copies: a reshaped view would keep the whole batch alive.
     return Odometry(
@@ -231,10 +197,7 @@ def _message(frame: str, child: str, stamp_ns: int, mean: list[float], cov: Floa
 def _state(msg: Odometry, needs_orientation: bool) -> tuple[Floats, Floats]:
     """Return the full state, mean (12,) and cov (12, 12), the twist as it stands in the message."""
     position, linear, angular = msg.pose.pose.position, msg.twist.twist.linear, msg.twist.twist.angular
-    yaw = 0.0
-    if needs_orientation:
-        x, y, z, w = unit_quaternion(msg.pose.pose.orientation)
-        yaw = float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+    yaw = yaw_of(msg.pose.pose.orientation) if needs_orientation else 0.0
     mean = np.array([position.x, position.y, position.z, 0.0, 0.0, yaw,
                      linear.x, linear.y, linear.z, angular.x, angular.y, angular.z], np.float64)  # fmt: skip
     cov = np.zeros((_SIZE, _SIZE))
@@ -265,40 +228,3 @@ def _turned(mean: Floats, cov: Floats, rotation: Floats) -> tuple[Floats, Floats
             with np.errstate(invalid="ignore"):  # the library judges what is not finite
                 cov[:, a, b] = rotation @ cov[:, a, b] @ rotation.swapaxes(-1, -2)
     return mean, cov
-
-
-def _yaw_rotation(yaw: Floats) -> Floats:
-    """Return the rotations (N, 3, 3) about z."""
-    out = np.zeros((len(yaw), 3, 3))
-    out[:, 0, 0] = out[:, 1, 1] = np.cos(yaw)
-    out[:, 1, 0] = np.sin(yaw)
-    out[:, 0, 1] = -out[:, 1, 0]
-    out[:, 2, 2] = 1.0
-    return out
-
-
-def unit_quaternion(q: Quaternion) -> tuple[float, float, float, float]:
-    """Return x, y, z, w of an orientation, scaled to norm 1.
-
-    Raises
-    ------
-    MessageError    `bad_orientation`: not a number, zero (never filled in) or far from norm 1
-    """
-    norm = float(q.x**2 + q.y**2 + q.z**2 + q.w**2)
-    if not abs(norm - 1.0) <= QUATERNION_TOLERANCE:
-        raise MessageError(
-            "bad_orientation",
-            f"The orientation must be a unit quaternion, since the twist is in its frame. Got ({q.x}, {q.y}, {q.z}, "
-            f"{q.w}) (x, y, z, w).",
-        )
-    scale = norm**-0.5
-    return q.x * scale, q.y * scale, q.z * scale, q.w * scale
-
-
-def rotation_matrix(x: float, y: float, z: float, w: float) -> Floats:
-    """Return the rotation parent_from_body (3, 3) of a unit quaternion."""
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
-from msg_adapters.arrays import MessageError, TrackArrays
+from msg_adapters.arrays import TrackArrays, one_track, slots_of
 from msg_adapters.header import stamp_to_ns
-from msg_adapters.odometry import one_track
 
 _SLOT = {"x": 0, "y": 1, "z": 2}
 
@@ -30,12 +29,7 @@ def pose_from_msg(
     ------
     MessageError    `missing_axis`: an axis other than x, y, z, or none
     """
-    missing = [a for a in axes if a not in _SLOT]
-    if missing or not axes:
-        raise MessageError(
-            "missing_axis", f"The axes of a pose must be of {', '.join(_SLOT)}. Got {', '.join(missing) or 'none'}."
-        )
-    slots = np.array([_SLOT[a] for a in axes])
+    slots = slots_of(axes, _SLOT, "a pose")
     position = msg.pose.pose.position
     mean = np.array([position.x, position.y, position.z], np.float64)[slots]
     cov = np.array(msg.pose.covariance, np.float64).reshape(6, 6)[slots[:, None], slots]

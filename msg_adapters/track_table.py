@@ -11,20 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
 
-from msg_adapters._table import (
-    PLANS,
-    Block,
-    Column,
-    Fields,
-    Layout,
-    Rows,
-    Signature,
-    cov_name,
-    make_layout,
-    new_cloud,
-    signature,
-    upper_triangle,
-)
+from msg_adapters._table import PLANS, cov_name
+from msg_adapters._table_reading import Block, Column, Fields, Rows, Signature, signature
+from msg_adapters._table_writing import Layout, make_layout, new_cloud, upper_triangle
 from msg_adapters.arrays import MessageError, TrackArrays, TrackLike
 from msg_adapters.header import stamp_to_ns
 
@@ -145,7 +134,7 @@ def _layout(axes: tuple[str, ...], uuid: bool, dof: bool, phd: bool) -> Layout:
     columns = [c for c in columns if written.get(c[0], True)]
     if reserved := sorted(_RESERVED.intersection(axes)):
         raise ValueError(f"The axes must not have the names of other fields. Got {', '.join(reserved)}.")
-    layout = make_layout(columns, axes, with_cov=True)
+    layout = make_layout(tuple(columns), axes, with_cov=True)
     read = _axes(f.name for f in layout.fields)
     if read != axes:
         raise ValueError(f"The axes must be told from their covariance names. Got {axes!r}, read as {read!r}.")

@@ -17,11 +17,20 @@ from ros_helpers import own_domain
 ROOT = Path(__file__).resolve().parent.parent
 # Domains up to 101 keep Fast DDS's ports below the range from which Linux hands out ephemeral ones; 0 is the users'.
 DOMAINS = range(1, 102)
+# What is tested in these folders no version of NumPy or SciPy changes: texts, processes, packaging.
+ONCE = frozenset({"bags", "cli", "nodes", "package", "plugins", "tools"})
 
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(ROOT / "config" / "fastdds_fast_discovery.xml")
 os.environ.setdefault("ROS_DOMAIN_ID", str(DOMAINS[-1]))  # for a test that forgets its fixture: not the users' domain
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that `make test` need not repeat with other versions."""
+    for item in items:
+        if item.path.relative_to(ROOT / "test").parts[0] in ONCE:
+            item.add_marker(pytest.mark.once)
 
 
 @pytest.fixture

@@ -370,3 +370,37 @@ def test_bad_covariances_are_found_one_by_one() -> None:
     assert is_positive_definite(good[1:13].reshape(3, 4, 3, 3)).all()
     assert is_positive_definite(np.zeros((0, 3, 3))).shape == (0,)
     assert not is_positive_definite(-np.eye(2))
+
+
+# Values -------------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_owned_can_be_written_to_by_nobody() -> None:
+    base = np.zeros((N, 4))
+    fields = arrays(mean=base[:, None], uuid=np.zeros((N, 16), np.uint8))
+    batch = TrackBatch(**fields)
+    own = batch.owned()
+    assert_equal(own, batch)
+    base[:] = 7.0
+    assert (batch.mean == 7.0).all()
+    assert not own.mean.any()
+    for field in dataclasses.fields(TrackBatch):
+        if isinstance(array := getattr(own, field.name), np.ndarray):
+            with pytest.raises(ValueError, match="read-only"):
+                array[...] = 0
+    again = own.owned()
+    assert all(getattr(again, f.name) is getattr(own, f.name) for f in dataclasses.fields(TrackBatch))
+
+
+def test_what_was_worked_out_is_kept_until_its_arrays_are_replaced() -> None:
+    batch = TrackBatch(**arrays(c=2))
+    conditioned, moments = batch.well_conditioned, batch.moments
+    assert conditioned.all()
+    later = batch.replace(time_ns=batch.time_ns + 1).owned()
+    assert later.well_conditioned is conditioned
+    moved = batch.replace(mean=batch.mean + 1.0)
+    assert moved.well_conditioned is conditioned
+    np.testing.assert_allclose(moved.moments[0], moments[0] + 1.0)
+    singular = batch.replace(cov=np.ones_like(batch.cov))
+    assert not singular.well_conditioned.any()
+    np.testing.assert_array_equal(batch[[2, 0]].well_conditioned, conditioned[[2, 0]])

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import textwrap
@@ -14,7 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from track_fusion.params import Params, specs
+from track_fusion.params import Params, Spec, specs
+from track_fusion.plugins import Registry
 
 if TYPE_CHECKING:
     from track_fusion.models.choices import Choice
@@ -46,9 +48,10 @@ class Section(NamedTuple):
 )  # fmt: skip
 @click.pass_context
 def docs(ctx: click.Context, check: bool, picture: bool, root: Path) -> None:
-    """Write doc/rules.md, doc/scenarios.md, the table of doc/choosing-a-rule.md and the parameter files of config/.
+    """Write doc/rules.md, doc/scenarios.md, the tables of other pages in doc/ and the parameter files of config/.
 
-    They are made from the registries of rules and scenarios and the parameter dataclasses, and change with them.
+    They are made from the registries of rules and scenarios, the parameter dataclasses and the rooms of tools/house.py,
+    and change with them.
     Needs ROS 2.
     """
     if not (root / "package.xml").is_file():
@@ -81,6 +84,7 @@ def generated() -> dict[str, str]:
         "doc/rules.md": rules_page(),
         "doc/choosing-a-rule.md": choosing_page(),
         "doc/scenarios.md": scenarios_page(),
+        "doc/architecture.md": architecture_page(),
         "config/fusion_centre.yaml": parameter_file("fusion_centre", fusion_centre_sections()),
         "config/sensor_tracker.yaml": parameter_file("sensor_tracker", sensor_tracker_sections()),
     }
@@ -95,10 +99,23 @@ def choosing_page() -> str:
     """Return doc/choosing-a-rule.md, written by hand but for its table of promises."""
     from track_fusion.rules import RULES
 
-    rows = [(f"[`{r.key}`](rules.md#{r.key})", r.guarantee, r.caveat, r.cost, r.source) for r in RULES.values()]
-    table = _table(("rule", "promise", "when, or what breaks it", "cost", "source"), rows)
-    text = (SOURCE_TREE / "doc" / "choosing-a-rule.md").read_text(encoding="utf-8")
-    return _TABLE.sub(lambda found: f"{found[1]}{table}\n{found[2]}", text)
+    rows = [(f"[`{r.key}`](rules.md#{r.key})", r.guarantee, r.caveat, r.cost, r.source) for r in RULES.own.values()]
+    return _filled("choosing-a-rule.md", _table(("rule", "promise", "when, or what breaks it", "cost", "source"), rows))
+
+
+def architecture_page() -> str:
+    """Return doc/architecture.md, written by hand but for its table of rooms."""
+    from tools.house import FLOORS
+
+    height = len(FLOORS) - 1
+    rows = [(str(height - k), f"`{name}`", what) for k, rooms in enumerate(FLOORS) for name, what in rooms.items()]
+    return _filled("architecture.md", _table(("floor", "room", "what is in it"), rows))
+
+
+def _filled(name: str, table: str) -> str:
+    """Put a table between the two marks of a page in doc/."""
+    text = (SOURCE_TREE / "doc" / name).read_text(encoding="utf-8")
+    return _TABLE.sub(lambda marks: f"{marks[1]}{table}\n{marks[2]}", text)
 
 
 def rules_page() -> str:
@@ -106,7 +123,7 @@ def rules_page() -> str:
     from track_fusion.cli.rules import describe
     from track_fusion.rules import RULES
 
-    described = [describe(rule) for rule in RULES.values()]
+    described = [describe(rule) for rule in RULES.own.values()]
     columns = ("rule", "family", "tracks", "guarantee", "source", "cost")
     rows = [(f"[`{r['key']}`](#{r['key']})", r["family"], r["arity"], r["guarantee"], r["source"], r["cost"])
             for r in described]  # fmt: skip
@@ -142,7 +159,7 @@ def _rule_section(rule: dict[str, Any]) -> str:
 
 def scenarios_page() -> str:
     """Return doc/scenarios.md."""
-    from track_fusion.demo.bringup import demos_of
+    from track_fusion.demo.wiring import demos_of
     from track_fusion.scenarios import SCENARIOS
 
     rows = [(f"[`{s.key}`](#{s.key})", s.title, "yes" if demos_of(s.key) else "") for s in SCENARIOS.values()]
@@ -159,7 +176,7 @@ def scenarios_page() -> str:
 
 
 def _scenario_section(scenario: Scenario) -> str:
-    from track_fusion.demo.bringup import demos_of
+    from track_fusion.demo.wiring import demos_of
     from track_fusion.report.page import assumption_text
 
     demos = ", ".join(f"`track-fusion demo {name}`" for name in demos_of(scenario.key))
@@ -186,7 +203,7 @@ def _table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 def fusion_centre_sections() -> list[Section]:
     """List what the fusion centre declares; a test compares it with the node."""
-    from track_fusion.centre.config import FusionCentreParams, RuleParams, ScanBufferParams, TrackManagerParams
+    from track_fusion.centre.config import FusionCentreParams, ScanBufferParams, StateFusionParams, TrackManagerParams
     from track_fusion.models.choices import MOTIONS, MotionChoice
     from track_fusion.nodes.fusion_centre import SourceParams
     from track_fusion.nodes.managed import ManagedParams
@@ -197,9 +214,9 @@ def fusion_centre_sections() -> list[Section]:
     used = "read when state_fusion is"
     return [
         *map(Section, (FrameParams, SourceParams, MotionChoice)),
-        *_alternatives("motion", MOTIONS, MotionChoice().motion),
-        *map(Section, (RuleParams, FusionCentreParams)),
-        *(Section(r.params, f"{key}.", f"{r.title}: {used} {key}.") for key, r in RULES.items() if specs(r.params)),
+        *_alternatives("motion", MOTIONS.own, MotionChoice().motion),
+        *map(Section, (StateFusionParams, FusionCentreParams)),
+        *(Section(r.params, f"{key}.", f"{r.title}: {used} {key}.") for key, r in RULES.own.items() if specs(r.params)),
         *map(Section, (ScanBufferParams, TrackManagerParams)),
         Section(RandomParams, title="Random numbers of rules that draw samples: seed, run and role name a stream."),
         Section(ManagedParams),
@@ -212,15 +229,15 @@ def sensor_tracker_sections() -> list[Section]:
     from track_fusion.nodes.managed import ManagedParams
     from track_fusion.nodes.screening import FrameParams
     from track_fusion.nodes.sensor_tracker import FeedbackParams, OutputParams
-    from track_fusion.trackers.filters import TRACK_FILTERS
+    from track_fusion.trackers.filters import FILTERS
     from track_fusion.trackers.many_targets import PdaTracker, PdaTrackerParams
     from track_fusion.trackers.one_target import MULTI_TARGET, SensorTrackerParams, TrackerChoice
 
     default = TrackerChoice()
-    filters: dict[str, Choice[Any]] = {**TRACK_FILTERS, MULTI_TARGET: Choice(PdaTrackerParams, PdaTracker)}
+    filters: dict[str, Choice[Any]] = {**FILTERS, MULTI_TARGET: Choice(PdaTrackerParams, PdaTracker)}
     return [
         *map(Section, (FrameParams, TrackerChoice)),
-        *_alternatives("motion", MOTIONS, default.motion),
+        *_alternatives("motion", MOTIONS.own, default.motion),
         *_alternatives("sensor", SENSORS, default.sensor),
         *_alternatives("filter", filters, default.filter),
         *map(Section, (SensorTrackerParams, FeedbackParams, OutputParams, ManagedParams)),
@@ -251,12 +268,17 @@ def parameter_file(node: str, sections: Iterable[Section]) -> str:
         lines += ["", *_comment([f"--- {section.heading}"], "    ")]
         for name, (spec, default) in specs(section.params).items():
             unit = f" {spec.unit}" if spec.unit else ""
-            lines += _comment([f"{spec.doc} ({spec.wanted()}{',' + unit if unit else ''})"], "    ")
+            lines += _comment([f"{spec.doc} ({_ours(spec).wanted()}{',' + unit if unit else ''})"], "    ")
             # ROS has no list without entries: it stays unset.
             value = yaml_value(default) if default != () else "unset"
             mark = "" if section.declared and default != () else "# "
             lines.append(f"    {mark}{section.prefix}{name}: {value}")
     return "\n".join(lines) + "\n"
+
+
+def _ours(spec: Spec) -> Spec:
+    """Leave out of the choices what other packages on this machine bring."""
+    return dataclasses.replace(spec, choices=spec.choices.own) if isinstance(spec.choices, Registry) else spec
 
 
 def _comment(paragraphs: Iterable[str], indent: str) -> list[str]:

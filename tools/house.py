@@ -17,14 +17,14 @@ ROOT = Path(__file__).resolve().parent.parent
 #: Rooms by floor, from the top down: a module imports from its own room and from the floors below.
 FLOORS: tuple[Mapping[str, str], ...] = (
     {"cli": "the command track-fusion, one command a file"},
-    {"demo": "bring-up of processes, the demonstration, recording"},
+    {"demo": "the wiring and the processes of a scenario's nodes, the demonstration"},
     {"nodes": "the ROS nodes: thin"},
     {
         "bags": "bags without ROS",
         "scenarios": "one published study a folder",
         "report": "pages and pictures",
     },
-    {"study": "what a scenario is: runs, samples, figures, claims and verdicts"},
+    {"study": "what a scenario is: runs, outcomes, figures, claims and verdicts"},
     {"centre": "the fusion centre: a value and pure steps"},
     {"peers": "decentralised fusion"},
     {"trackers": "detections in, tracks out"},
@@ -36,33 +36,31 @@ FLOORS: tuple[Mapping[str, str], ...] = (
     {"metrics": "accuracy, consistency, evaluation, significance"},
     {"association": "gate, cost, assignment"},
     {"solvers": "numerics that know nothing of tracks"},
-    {"ground": "data model, parameters, linear algebra, angles, random streams"},
+    {"ground": "modules outside any folder: data model, parameters, linear algebra, angles, random streams"},
 )
 #: The modules that stand on the ground, outside any folder, and the package itself.
 GROUND = frozenset({"", "angles", "layouts", "linalg", "params", "plugins", "random_streams", "tracks"})
 #: Only these rooms know ROS.
 ROS_ROOMS = frozenset({"demo", "nodes"})
-#: The adapters stand beside the house: it may use them, they know nothing of it.
+#: The adapters stand beside the house: these rooms use them, they know nothing of it.
 ADAPTERS = "msg_adapters"
 ADAPTER_USERS = frozenset({"bags", "demo", "nodes"})
+#: What belongs to ROS beside message packages: by name, or by how the name begins.
+ROS = frozenset({"ament_index_python", "diagnostic_updater", "launch", "launch_ros", "message_filters", "rclpy"})
+ROS_PREFIXES = ("rosbag2_", "rosidl_", "tf2_")
+#: What an installed package does not bring along.
+NOT_INSTALLED = frozenset({"benchmark", "test", "tools"})
 
 
 def faults(root: Path) -> list[str]:
     """Return what breaks the rules in a source tree, one line each: the arrow, and why it must not be."""
-    modules = {_name(path, root): path for path in sorted((root / "track_fusion").rglob("*.py"))}
-    arrows = {name: sorted(set(_arrows(path, name, modules))) for name, path in modules.items()}
-    lines = [f"{name} is in no room" for name in modules if _floor(name) is None]
+    paths = sorted(path for package in ("track_fusion", ADAPTERS) for path in (root / package).rglob("*.py"))
+    modules = {_name(path, root): path for path in paths}
+    arrows = {name: sorted(set(_arrows(path, root, name, modules))) for name, path in modules.items()}
+    lines = [f"{name} is in no room" for name in modules if _ours(name) and _floor(name) is None]
     for name, targets in arrows.items():
-        lines += [fault for line, target in targets if (fault := _fault(name, target, line))]
-    lines += [f"circle: {' -> '.join(circle)}" for circle in _circles(arrows)]
-    for path in sorted((root / ADAPTERS).rglob("*.py")):
-        name = _name(path, root)
-        allowed = {*sys.stdlib_module_names, "numpy", ADAPTERS}
-        for line, target in imported(path, root):
-            top = target.split(".")[0]
-            if top not in allowed and (not is_ros(target) or top == "rclpy"):
-                lines.append(f"{name}:{line} -> {target}: an adapter imports messages and NumPy only")
-    return lines
+        lines += [f"{name}:{line} -> {target}: {why}" for line, target in targets if (why := _fault(name, target))]
+    return lines + [f"circle: {' -> '.join(circle)}" for circle in _circles(arrows)]
 
 
 def room(name: str) -> str:
@@ -71,14 +69,21 @@ def room(name: str) -> str:
     return "ground" if first in GROUND else first
 
 
-def is_ros(name: str) -> bool:
-    """Tell whether a module belongs to ROS."""
-    top = name.split(".")[0]
-    return top in {"rclpy", "tf2_ros", "ament_index_python"} or top.endswith(("_msgs", "_interfaces"))
+def is_message_package(top: str) -> bool:
+    """Tell whether a package holds messages or services of ROS."""
+    return top.endswith(("_msgs", "_interfaces"))
+
+
+def is_ros(top: str) -> bool:
+    """Tell whether a package belongs to ROS."""
+    return top in ROS or top.startswith(ROS_PREFIXES) or is_message_package(top)
 
 
 def imported(path: Path, root: Path) -> Iterator[tuple[int, str]]:
-    """Yield line and full name of everything a file imports, also inside functions; of relative imports, too."""
+    """Yield line and full name of everything a file imports: inside functions, relative, by `import_module`, too.
+
+    Of a name that is put together as the program runs, only the constant beginning is known: it ends in a star.
+    """
     package = path.relative_to(root).parent.parts
     for item in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(item, ast.Import):
@@ -87,10 +92,32 @@ def imported(path: Path, root: Path) -> Iterator[tuple[int, str]]:
             base = list(package[: len(package) - item.level + 1]) if item.level else []
             base += [item.module] if item.module else []
             yield from ((item.lineno, ".".join([*base, alias.name])) for alias in item.names)
+        elif isinstance(item, ast.Call) and item.args and _called(item) in {"import_module", "__import__"}:
+            name = _spelt(item.args[0])
+            level = len(name) - len(name.lstrip("."))
+            anchor = _spelt(item.args[1]).split(".") if len(item.args) > 1 else list(package)
+            yield item.lineno, ".".join([*anchor[: len(anchor) - level + 1], name[level:]] if level else [name])
+
+
+def _called(call: ast.Call) -> str:
+    """Return the last part of the name of what is called."""
+    return getattr(call.func, "attr", getattr(call.func, "id", ""))
+
+
+def _spelt(text: ast.expr) -> str:
+    """Return a string; of one that is formatted or added, its beginning and a star."""
+    if isinstance(text, ast.Constant):
+        return str(text.value)
+    first = text.values[0] if isinstance(text, ast.JoinedStr) and text.values else getattr(text, "left", None)
+    return f"{_spelt(first).rstrip('*')}*" if first else "*"
 
 
 def _name(path: Path, root: Path) -> str:
     return ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
+
+
+def _ours(name: str) -> bool:
+    return name.split(".")[0] == "track_fusion"
 
 
 def _floor(name: str) -> int | None:
@@ -98,29 +125,36 @@ def _floor(name: str) -> int | None:
     return next((len(FLOORS) - 1 - k for k, rooms in enumerate(FLOORS) if room(name) in rooms), None)
 
 
-def _arrows(path: Path, own: str, modules: Mapping[str, Path]) -> Iterator[tuple[int, str]]:
-    """Yield line and target of each import: the module it names where it is ours."""
-    for line, target in imported(path, path.parents[own.count(".") + (path.name == "__init__.py")]):
-        if target.split(".")[0] == "track_fusion":
-            while target not in modules and "." in target:
-                target = target.rpartition(".")[0]
-        if target != own:
-            yield line, target
+def _arrows(path: Path, root: Path, own: str, modules: Mapping[str, Path]) -> Iterator[tuple[int, str]]:
+    """Yield line and target of each import: the module of ours that it names, or is in."""
+    for line, target in imported(path, root):
+        parts = [] if target.endswith("*") else target.split(".")
+        ways = (".".join(parts[:k]) for k in range(len(parts), 1, -1))
+        module = next((way for way in ways if way in modules), target)
+        if module not in {own, "*"}:
+            yield line, module
 
 
-def _fault(name: str, target: str, line: int) -> str | None:
-    arrow = f"{name}:{line} -> {target}"
-    if is_ros(target):
-        return None if room(name) in ROS_ROOMS else f"{arrow}: the library imports ROS"
-    if target.split(".")[0] == ADAPTERS:
-        users = ", ".join(sorted(ADAPTER_USERS))
-        return None if room(name) in ADAPTER_USERS else f"{arrow}: only {users} read messages"
-    if target.split(".")[0] != "track_fusion" or room(target) == room(name):
+def _fault(name: str, target: str) -> str | None:
+    """Tell why a module must not import another, if so."""
+    top = target.split(".")[0]
+    if top in NOT_INSTALLED:
+        return "is not installed with the package"
+    if not _ours(name):
+        allowed = top in {*sys.stdlib_module_names, "numpy", ADAPTERS} or is_message_package(top)
+        return None if allowed else "an adapter imports messages and NumPy only"
+    if is_ros(top):
+        return None if room(name) in ROS_ROOMS else "the library imports ROS"
+    if top == ADAPTERS:
+        return None if room(name) in ADAPTER_USERS else f"only {', '.join(sorted(ADAPTER_USERS))} read messages"
+    if not _ours(target) or room(target) == room(name):
         return None
     own, other = _floor(name), _floor(target)
+    if target.endswith("*") and other is None:
+        return "names no room"
     if own is None or other is None or other < own:
         return None
-    return f"{arrow}: an arrow goes {'up' if other > own else 'across'}"
+    return f"an arrow goes {'up' if other > own else 'across'}"
 
 
 def _circles(arrows: Mapping[str, list[tuple[int, str]]]) -> Iterator[list[str]]:
@@ -140,6 +174,6 @@ def _circles(arrows: Mapping[str, list[tuple[int, str]]]) -> Iterator[list[str]]
 
 
 if __name__ == "__main__":
-    found = faults(ROOT)
-    print("\n".join(found) or "The house is in order.")
-    sys.exit(bool(found))
+    lines = faults(ROOT)
+    print("\n".join(lines) or "The house is in order.")
+    sys.exit(bool(lines))

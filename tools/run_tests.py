@@ -1,13 +1,17 @@
-"""Run the stages of `make test`, print what each took, and fail when one fails.
+"""Run stages of tests, print what each took, and fail when one fails.
 
-    .venv/bin/python tools/run_tests.py [lint] [suite] [colcon] [floor] [bare]
+    .venv/bin/python -m tools.run_tests [STAGE ...]     those of `make test`, unless named
+    .venv/bin/python -m tools.run_tests --rest          those that `make test-all` adds to them
 
-Without names all stages run, the later ones also when an earlier one failed. JUnit files land in out/test/.
+No test runs twice with the same versions. Later stages run also when an earlier one failed. JUnit files land in
+out/test/.
 """
 
 from __future__ import annotations
 
 import argparse
+import atexit
+import contextlib
 import dataclasses
 import os
 import shutil
@@ -15,13 +19,13 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
-sys.path.insert(0, str(Path(__file__).parent))
-from make_venv import WHEEL_VARIABLES, sourced_prefixes
+from tools.make_venv import WHEEL_VARIABLES, sourced_prefixes
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "out" / "test"
@@ -29,13 +33,15 @@ PYTHON = ROOT / ".venv" / "bin" / "python"
 EXECUTABLES = ("sensor_tracker", "fusion_centre", "replay", "evaluator", "track-fusion")
 # Not .venv/bin/colcon: with a sourced ROS, colcon may be the system's, whose tests would not see the environment.
 COLCON = "import sys; from colcon_core.command import main; sys.exit(main())"
-EXTRAS = ("click", "rich", "rosbags", "matplotlib")
+EXTRAS = ("click", "jsonschema", "rich", "rosbags", "matplotlib")
 FLOOR = ("numpy==1.26.*", "scipy==1.11.*")
 FLOOR_PYTHONS = ((3, 11), (3, 12))  # NumPy 1.26 has no wheel for later ones
 # Two tests at a time on two cores; a file's tests stay together, for they share processes.
 PARALLEL = ("-n", "auto", "--dist", "loadfile")
 # Threads of BLAS only fight for the cores: with SciPy 1.11's, tests of small matrices take five times as long.
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
+# Hundreds of processes start: compiled modules are kept, whatever the shell says.
+DROPPED = ("PYTHONDONTWRITEBYTECODE",)
 COMMAND_LIMIT_S = 1200  # far above what any one command takes; a hang must not outlive it
 
 
@@ -64,6 +70,10 @@ class Counts:
         return f"{self.passed} passed, {self.failed} failed, {self.skipped} skipped"
 
 
+#: Commands at work, to be ended with this one.
+running: set[subprocess.Popen[str]] = set()
+
+
 def run(
     command: Sequence[object], *, cwd: Path = ROOT, env: dict[str, str] | None = None, capture: bool = False
 ) -> str:
@@ -71,16 +81,19 @@ def run(
     words = [str(word) for word in command]
     shown = " ".join(words).replace(f"{PYTHON} -c {COLCON}", "colcon").replace(f"{ROOT}/", "")
     print("$", shown, flush=True)
-    clean = {k: v for k, v in (env or dict(os.environ)).items() if k not in WHEEL_VARIABLES or sourced_prefixes()}
+    dropped = DROPPED if sourced_prefixes() else (*DROPPED, *WHEEL_VARIABLES)
+    clean = {k: v for k, v in (env or os.environ).items() if k not in dropped}
     process = subprocess.Popen(
         words, cwd=cwd, env=clean, text=True, stdout=subprocess.PIPE if capture else None, start_new_session=True
     )
+    running.add(process)
     try:
         output, _ = process.communicate(timeout=COMMAND_LIMIT_S)
     except subprocess.TimeoutExpired:
         raise StageFailure(f"took longer than {COMMAND_LIMIT_S} s: {shown}") from None
     finally:
         stop_group(process)
+        running.discard(process)
     if process.returncode != 0:
         print(output or "", end="")
         raise StageFailure(f"exit code {process.returncode} from: {shown}")
@@ -94,6 +107,12 @@ def stop_group(process: subprocess.Popen[str]) -> None:
     except ProcessLookupError:
         return
     process.wait()
+
+
+def end_commands() -> None:
+    """End all commands at work and what they left running."""
+    for process in list(running):
+        stop_group(process)
 
 
 def junit_counts(path: Path) -> Counts:
@@ -144,8 +163,13 @@ def lint(counts: list[Counts]) -> None:
 
 
 def suite(counts: list[Counts]) -> None:
-    """Run the whole test suite."""
-    pytest("suite", counts, *PARALLEL)
+    """Run every test that is not slow."""
+    pytest("suite", counts, *PARALLEL, "-m", "not slow")
+
+
+def slow(counts: list[Counts]) -> None:
+    """Run the slow tests."""
+    pytest("slow", counts, *PARALLEL, "-m", "slow")
 
 
 def colcon(counts: list[Counts]) -> None:
@@ -209,9 +233,9 @@ def check_installed_command(workspace: Path, env: dict[str, str]) -> None:
         '"$OLDPWD"/install/track_fusion/lib/track_fusion/track-fusion rules --json > /dev/null'
     )
     path = f"{PYTHON.parent}{os.pathsep}{os.environ['PATH']}"
-    found = run(["sh", "-c", script], cwd=workspace, env={**env, "PATH": path}, capture=True).strip()
-    if not found.startswith(str(workspace / "install")):
-        raise StageFailure(f"the built workspace loads track_fusion from {found}")
+    loaded = run(["sh", "-c", script], cwd=workspace, env={**env, "PATH": path}, capture=True).strip()
+    if not loaded.startswith(str(workspace / "install")):
+        raise StageFailure(f"the built workspace loads track_fusion from {loaded}")
 
 
 def marked_tests(source: Path) -> int:
@@ -222,11 +246,31 @@ def marked_tests(source: Path) -> int:
 
 
 def floor(counts: list[Counts]) -> None:
-    """Run the suite with the oldest NumPy and SciPy that are supported: those of Ubuntu 24.04."""
+    """Run what is neither slow nor the same with all versions, with the oldest NumPy and SciPy: Ubuntu 24.04's."""
+    pytest("floor", counts, *PARALLEL, "-m", "not slow and not once", python=floor_python())
+
+
+def floor_rest(counts: list[Counts]) -> None:
+    """Run all other tests with the oldest NumPy and SciPy."""
+    pytest("floor-rest", counts, *PARALLEL, "-m", "slow or once", python=floor_python())
+
+
+def floor_python() -> Path:
+    """Make or update the environment of the oldest versions; return its interpreter."""
     if sys.version_info[:2] not in FLOOR_PYTHONS:
         raise StageSkipped("NumPy 1.26 has no wheel for Python {}.{}".format(*sys.version_info[:2]))
-    python = make_venv(".venv-floor", "all,test", *FLOOR)
-    pytest("floor", counts, *PARALLEL, python=python)
+    with making:
+        return make_venv(".venv-floor", "all,test", *FLOOR)
+
+
+#: One at a time makes the environment of the oldest versions; for the next it is there.
+making = threading.Lock()
+
+
+def make_ahead() -> None:
+    """Make the environment of the oldest versions; when that fails, the stage that needs it tries again and tells."""
+    with contextlib.suppress(StageFailure, StageSkipped):
+        floor_python()
 
 
 def bare(counts: list[Counts]) -> None:
@@ -234,19 +278,18 @@ def bare(counts: list[Counts]) -> None:
     if sourced_prefixes():
         raise StageSkipped("with a sourced ROS the system's Python packages are seen, so no environment is bare")
     python = make_venv(".venv-bare", "")
-    found = run([python, "-c", f"import importlib.util as u; print(*filter(u.find_spec, {EXTRAS}))"], capture=True)
-    if found.strip():
-        raise StageFailure(f"the bare environment is not bare: it has {found.strip()}")
+    extras = run([python, "-c", f"import importlib.util as u; print(*filter(u.find_spec, {EXTRAS}))"], capture=True)
+    if extras.strip():
+        raise StageFailure(f"the bare environment is not bare: it has {extras.strip()}")
     pytest("bare", counts, "test/package/test_nodes_start.py", TRACK_FUSION_NODE_PYTHON=str(python))
 
 
-STAGES: dict[str, Callable[[list[Counts]], None]] = {
-    "lint": lint,
-    "suite": suite,
-    "colcon": colcon,
-    "floor": floor,
-    "bare": bare,
-}
+Stage = Callable[[list[Counts]], None]
+#: `make test`: what a change breaks first.
+TEST: dict[str, Stage] = {"lint": lint, "suite": suite, "floor": floor}
+#: What `make test-all` adds: what is slow or needs more.
+REST: dict[str, Stage] = {"slow": slow, "floor-rest": floor_rest, "colcon": colcon, "bare": bare}
+STAGES = TEST | REST
 
 
 def run_stage(name: str, counts: list[Counts]) -> tuple[str, float]:
@@ -265,27 +308,39 @@ def run_stage(name: str, counts: list[Counts]) -> tuple[str, float]:
     return outcome, took_s
 
 
-def main() -> int:
-    """Run the stages named, or all; print the summary; return the exit code."""
-    parser = argparse.ArgumentParser(description="Run the stages of `make test`.")
-    parser.add_argument("stages", nargs="*", metavar="STAGE", help=", ".join(STAGES))
-    names = parser.parse_args().stages or list(STAGES)
-    unknown = [name for name in names if name not in STAGES]
+def chosen() -> tuple[list[str], bool]:
+    """Read from the command line which stages are to run, and whether they are the second half of `make test-all`."""
+    parser = argparse.ArgumentParser(description="Run stages of tests.")
+    parser.add_argument("stages", nargs="*", metavar="STAGE", help=f"{', '.join(STAGES)}; none: {', '.join(TEST)}")
+    parser.add_argument("--rest", action="store_true", help=f"the second half of `make test-all`: {', '.join(REST)}")
+    options = parser.parse_args()
+    unknown = [name for name in options.stages if name not in STAGES]
     if unknown:
         parser.error(f"no stage {', '.join(unknown)}; there are {', '.join(STAGES)}")
+    return options.stages or list(REST if options.rest else TEST), options.rest
+
+
+def main() -> int:
+    """Run stages; print the summary; return the exit code."""
+    names, rest = chosen()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what runs is ended, as on Ctrl-C
+    atexit.register(end_commands)
     RESULTS.mkdir(parents=True, exist_ok=True)
-    counts: list[Counts] = []
+    # The last line of `make test-all` counts what its first half, `make test`, has run just before.
+    before = [RESULTS / f"{name}.xml" for name in TEST if rest]
+    counts = [junit_counts(path) for path in before if path.exists()]
+    if "floor" in names[1:]:  # meanwhile earlier stages run: it waits for the network more than it computes
+        threading.Thread(target=make_ahead, daemon=True).start()
     results = {name: run_stage(name, counts) for name in names}
     print("\n=== Summary")
     for name, (outcome, took_s) in results.items():
-        print(f"{name:8}{took_s:7.1f} s  {outcome}")
+        print(f"{name:12}{took_s:7.1f} s  {outcome}")
     failed = [name for name, (outcome, _) in results.items() if outcome.startswith("FAILED")]
-    print(f"{'all':8}{sum(took_s for _, took_s in results.values()):7.1f} s")
+    print(f"{'all':12}{sum(took_s for _, took_s in results.values()):7.1f} s")
     if counts:
         print(f"tests: {sum(counts, Counts())}")
     if failed:
-        print(f"make test FAILED in: {', '.join(failed)}")
+        print(f"FAILED: {', '.join(failed)}")
     return 1 if failed else 0
 
 

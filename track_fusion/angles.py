@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from track_fusion.linalg import Array, logdet, outer
+from track_fusion.linalg import Array, logdet, merged_moments
 
 #: Period of a direction, radians.
 TURN = 2.0 * np.pi
@@ -126,11 +126,11 @@ def moments(weight: Array, mean: Array, cov: Array, periods: ArrayLike) -> tuple
               direction, and another reference gives another result.
     """
     weight = weight / weight.sum(-1, keepdims=True)
+    if not np.isfinite(periods).any():
+        return merged_moments(mean, cov, weight)
     reference = heaviest(weight, mean)
-    relative = difference(mean, reference[..., None, :], periods)
-    shift = np.einsum("...c,...ci->...i", weight, relative)
-    spread = cov + outer(relative - shift[..., None, :])
-    return shifted(reference, shift, periods), np.einsum("...c,...cij->...ij", weight, spread)
+    shift, merged = merged_moments(difference(mean, reference[..., None, :], periods), cov, weight)
+    return shifted(reference, shift, periods), merged
 
 
 def interpolate(start: Array, end: Array, share: Array, periods: ArrayLike) -> Array:

@@ -77,6 +77,48 @@ def logdet(cov: Array) -> Array:
     return np.asarray(2.0 * np.log(diagonal).sum(-1))
 
 
+def keep_sole(fused_mean: Array, fused_cov: Array, mean: Array, cov: Array, weights: Array) -> None:
+    """Where one track has weight 1 and all others 0, put that track itself in place of the computed result.
+
+    Shapes (..., n), (..., n, n), (..., K, n), (..., K, n, n), (..., K).
+    """
+    sole = (weights == 1.0) & (weights.sum(-1, keepdims=True) == 1.0)
+    if sole.any():
+        *batch, _ = at = np.nonzero(sole)
+        fused_mean[tuple(batch)], fused_cov[tuple(batch)] = mean[at], cov[at]
+
+
+def merged_moments(mean: Array, cov: Array, weights: Array) -> tuple[Array, Array]:
+    """Mean and covariance of a Gaussian mixture, Li 2022 (5), (10)-(11).
+
+    Parameters
+    ----------
+    mean : (..., K, n)
+    cov : (..., K, n, n)
+    weights : (..., K)    sum to one
+
+    Returns
+    -------
+    mean (..., n), cov (..., n, n)
+    """
+    origin = mean[..., 0, :]
+    offset = mean - origin[..., None, :]
+    shift = (weights[..., None] * offset).sum(-2)
+    spread = cov + outer(offset - shift[..., None, :])
+    merged_mean, merged_cov = origin + shift, symmetrise((weights[..., None, None] * spread).sum(-3))
+    keep_sole(merged_mean, merged_cov, mean, cov, weights)
+    return merged_mean, merged_cov
+
+
+def sample_moments(weight: Array, points: Array) -> tuple[Array, Array]:
+    """Mean (..., n) and covariance (..., n, n) of weighted samples: weight (..., N), sum one, points (..., N, n)."""
+    origin = points[..., :1, :]
+    offset = points - origin
+    shift = weight[..., None, :] @ offset
+    offset -= shift
+    return (origin + shift)[..., 0, :], symmetrise(transpose(weight[..., None] * offset) @ offset)
+
+
 #: A pivot of a matrix scaled to order one that is smaller counts as zero.
 SMALLEST_PIVOT = 1e-9
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, TypeVar
 
 import numpy as np
@@ -25,6 +25,10 @@ class ParameterError(ValueError):
     """A parameter has a wrong name or value; the message names it, the limit and the value got."""
 
 
+class Fault(Exception):
+    """What a program cannot go on with, through no parameter: it ends with exit code 1 and this message, one line."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Spec:
     """What is known of one parameter besides its name and default."""
@@ -34,7 +38,7 @@ class Spec:
     unit: str = ""
     low: float = -math.inf
     high: float = math.inf
-    choices: tuple[str, ...] = ()
+    choices: Collection[str] = ()
     sequence: bool = False
     strict: bool = False  # low itself is excluded
 
@@ -61,7 +65,7 @@ def param(
     unit: str = "",
     low: float = -math.inf,
     high: float = math.inf,
-    choices: Iterable[str] = (),
+    choices: Collection[str] = (),
     strict: bool = False,
     kind: type | None = None,
 ) -> Any:
@@ -71,7 +75,7 @@ def param(
     """
     sequence = isinstance(default, tuple)
     element = kind or (type(default[0]) if sequence and default else type(default))
-    spec = Spec(element, doc, unit, low, high, tuple(choices), sequence, strict)
+    spec = Spec(element, doc, unit, low, high, choices, sequence, strict)
     return dataclasses.field(default=default, metadata={"spec": spec})
 
 

@@ -167,9 +167,10 @@ class TrackBatch:
         """Return a batch with some arrays exchanged for computed ones of the same N; not checked again."""
         batch = object.__new__(TrackBatch)
         vars(batch).update(vars(self) | fields)
-        for cached, arrays in _CACHED.items():
-            if not arrays.isdisjoint(fields):
-                vars(batch).pop(cached, None)
+        if "cov" in fields:
+            vars(batch).pop("well_conditioned", None)
+        if "cov" in fields or "mean" in fields or "weight" in fields:
+            vars(batch).pop("moments", None)
         return batch
 
     def owned(self) -> TrackBatch:
@@ -250,8 +251,6 @@ class TrackBatch:
 
 #: The arrays that have a row a track, besides uuid.
 ROW_FIELDS = ("weight", "mean", "cov", "time_ns", "track_id", "source", "status", "existence", "dof")
-#: What is worked out once, and the arrays that it is of.
-_CACHED = {"moments": {"weight", "mean", "cov"}, "well_conditioned": {"cov"}}
 _DTYPES = {"weight": np.float64, "mean": np.float64, "cov": np.float64, "time_ns": np.int64, "track_id": np.int64,
            "source": np.uint32, "status": np.uint8, "existence": np.float64, "dof": np.float64}  # fmt: skip
 

@@ -1,16 +1,15 @@
 """The fusion centre: against an oracle that shares no code with it, the field's pains, consistency."""
 
 import dataclasses
-import importlib.util
-from pathlib import Path
 
 import numpy as np
 import pytest
+from oracles.fusion_centre import Settings, arithmetic_average, covariance_intersection, naive, run_centre
+from oracles.kalman import predict, update
 from scipy.stats import chi2
 
 from track_fusion.centre.centre import FusionCentre
 from track_fusion.centre.config import CentreConfig, FusionCentreParams, SourceConfig, TrackManagerParams
-from track_fusion.filters.kalman import predict, update
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
 from track_fusion.params import ParameterError
@@ -47,17 +46,6 @@ def tracks(positions, time_ns, cov=COV, **fields):
 # ---- against the oracle of the golden bags --------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def oracle():
-    """The oracle behind the golden bags: plain loops after doc/fusion-centre.md."""
-    pytest.importorskip("rosbags")
-    path = Path(__file__).parents[1] / "data" / "make_golden.py"
-    spec = importlib.util.spec_from_file_location("make_golden", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def random_scans(rng, sources):
     """Scans of moving, appearing and vanishing targets that come near each other; sources with rates of their own."""
     targets = rng.uniform(0, 12, (3, 2)), rng.normal(0, 3, (3, 2)), rng.integers(0, 10, 3), rng.integers(12, 30, 3)
@@ -83,27 +71,24 @@ def random_scans(rng, sources):
 @pytest.mark.parametrize("memory", [False, True], ids=["memoryless", "memory"])
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_random_scenes_equal_the_oracle(oracle, monkeypatch, seed, count, memory):
+def test_random_scenes_equal_the_oracle(seed, count, memory):
     rng = np.random.default_rng(1000 * count + seed)
     names = [f"sensor_{k}" for k in range(count)]
     pairs = count + memory == 2  # what the oracle's covariance intersection can do
-    rule = ("naive", "arithmetic_average", "covariance_intersection")[seed % (3 if pairs else 2)]
+    rule = (naive, arithmetic_average, covariance_intersection)[seed % (3 if pairs else 2)]
     scans = random_scans(rng, names)
-    changed = {
-        "sources": names, "deletion_threshold": [3, 4], "max_coast_s": 0.7, "max_scan_age_s": 0.15,
-        "gate_probability": (0.99, 0.7)[seed % 2],
-    }  # fmt: skip
-    settings = oracle.PARAMETERS | changed
-    monkeypatch.setattr(oracle, "PARAMETERS", settings)
-    monkeypatch.setattr(oracle, "MEMORY", memory)
-    wanted, _, margins = oracle.run_centre(scans, getattr(oracle, rule))
+    settings = Settings(
+        names, max_scan_age_s=0.15, gate_probability=(0.99, 0.7)[seed % 2], confirmation_threshold=(2, 3),
+        deletion_threshold=(3, 4), max_coast_s=0.7, process_noise=2.0, memory=memory,
+    )  # fmt: skip
+    wanted, _, margins = run_centre(scans, rule, settings)
     assert min(margins["gate"] + margins["assignment"], default=1.0) > 1e-9, "a decision hangs on rounding"
 
-    given = {k: settings[k] for k in ("gate_probability", "max_scan_age_s")}
-    manager = TrackManagerParams(**{k: settings[k] for k in TrackManagerParams.__dataclass_fields__})
-    motion = MotionParams(noise_form=settings["noise_form"], process_noise=settings["process_noise"])
-    rule_params = ArithmeticAverageParams(criterion="uniform") if rule == "arithmetic_average" else None
-    fuser = centre(count, rule, rule_params, manager, motion, memory=memory, **given)
+    given = {k: getattr(settings, k) for k in ("gate_probability", "max_scan_age_s", "memory")}
+    manager = TrackManagerParams(**{k: getattr(settings, k) for k in TrackManagerParams.__dataclass_fields__})
+    motion = MotionParams(noise_form="piecewise_constant", process_noise=settings.process_noise)
+    rule_params = ArithmeticAverageParams(criterion="uniform") if rule is arithmetic_average else None
+    fuser = centre(count, rule.__name__, rule_params, manager, motion, **given)
     published = 0
     for step in wanted:
         new = {}
@@ -262,6 +247,15 @@ def test_a_scan_used_before_starts_nothing():
     fuser.state = dataclasses.replace(fuser.state, central=none)
     fused, _ = fuser.step(SECOND, {})
     assert len(fused) == 0
+
+
+def test_a_scan_used_before_uses_up_no_identifier():
+    fuser = centre(1, max_scan_age_s=10.0)
+    fuser.step(0, {0: tracks([[0, 0]], 0)})
+    fuser.state = dataclasses.replace(fuser.state, central=fuser.state.central[np.zeros(1, bool)])
+    _, info = fuser.step(SECOND, {})
+    assert info.changes.born.tolist() == info.changes.deleted.tolist() == []
+    assert fuser.step(2 * SECOND, {0: tracks([[0, 0]], 2 * SECOND)})[0].track_id.tolist() == [2]
 
 
 def test_tentative_and_coasted_source_tracks_by_parameter():

@@ -59,11 +59,11 @@ def test_when_all_sources_are_silent_the_tracks_coast_and_are_deleted():
 
 def test_silence_of_a_source_is_told_and_not_waited_for():
     own = fusion_centre(source_timeout_s=0.5, fusion_timeout_s=0.2)
-    assert own.silence_s(0, SECOND) == -1.0
+    assert own.buffer.silence_s(0, SECOND) == -1.0
     own.receive(0, scan(SECOND), SECOND, SECOND)
     assert [p.time_ns for p in own.advance(SECOND)] == []
     assert [p.time_ns for p in own.advance(SECOND + 200 * MS)] == [SECOND]
-    assert own.silence_s(1, SECOND + 300 * MS) == pytest.approx(0.3)
+    assert own.buffer.silence_s(1, SECOND + 300 * MS) == pytest.approx(0.3)
     own.receive(0, scan(SECOND + 600 * MS), SECOND + 600 * MS, SECOND + 600 * MS)
     assert [p.time_ns for p in own.advance(SECOND + 600 * MS)] == [SECOND + 600 * MS]
 

@@ -70,6 +70,7 @@ def test_a_command_loads_only_what_it_needs(words: tuple[str, ...]) -> None:
     [
         ("click", ["rules"], "pip install '.[cli]' in the source tree"),
         ("rich", ["rules"], "pip install '.[cli]' in the source tree"),
+        ("jsonschema", ["fuse", "--rule", "naive"], "pip install '.[cli]' in the source tree"),
     ],
 )
 def test_a_missing_package_is_one_line(module: str, words: list[str], advice: str) -> None:

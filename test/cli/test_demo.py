@@ -9,8 +9,9 @@ import pytest
 from cli.runner import refusal, run
 
 from track_fusion.demo import demo as demonstration
-from track_fusion.demo.bringup import bringups
-from track_fusion.demo.demo import demo_of
+from track_fusion.demo.figures import figures
+from track_fusion.demo.plan import demo_of
+from track_fusion.demo.wiring import bringups
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.scenarios import SCENARIOS
 
@@ -53,7 +54,7 @@ def test_earlier_results_are_cleared(tmp_path: Path) -> None:
     (tmp_path / "bag").mkdir()
     for name in ("figures.json", "tracks.png", "nodes_naive.log", "evaluation_alone.json", "bag/bag_0.mcap"):
         (tmp_path / name).write_text("")
-    demonstration._clear(tmp_path)
+    demonstration.clear(tmp_path)
     assert not list(tmp_path.iterdir())
 
 
@@ -79,8 +80,8 @@ def test_every_scenario_that_can_run_over_ros_has_a_parameter_file() -> None:
 def test_the_table_sets_ros_beside_the_library_and_the_paper(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Without processes: what a variant of a rule is called, and a rule that the scenario does not know."""
     rules = ("covariance_intersection@uniform", "harmonic_mean")
-    monkeypatch.setattr(demonstration, "_over_ros", lambda demo, rule, progress: {"position_armse_m": 21.5})
-    monkeypatch.setattr(demonstration, "_picture", lambda demo: None)
+    monkeypatch.setattr(demonstration, "over_ros", lambda demo, rule, progress: {"position_armse_m": 21.5})
+    monkeypatch.setattr(demonstration, "picture", lambda demo: None)
     result = run("demo", "--rules", ",".join(rules), "--runs", "2", "--out", str(tmp_path / "out"))
     assert result.exit_code == 0, result.output
     (alone,), (variant,), (unknown,) = (
@@ -97,7 +98,7 @@ def test_figures_name_the_path_the_row_and_the_runs(monkeypatch: pytest.MonkeyPa
     name = "kf-covariance_intersection@uniform/position_armse_m"
     measured: Any = {name: Estimate(20.0, 0.5, 5)}
     over_ros = {"covariance_intersection@uniform": {"position_armse_m": 21.0}}
-    result = demonstration._figures(planned, over_ros, {name: Estimate(21.0, float("nan"), 1)}, measured)
+    result = figures(planned, over_ros, {name: Estimate(21.0, float("nan"), 1)}, measured)
     assert [(f["name"], f["value"]) for f in result["figures"]] == [
         (f"ros/{name}", 21.0),
         (f"library/{name}", 21.0),

@@ -313,8 +313,8 @@ def test_a_target_and_likelihoods_reach_the_average() -> None:
         params = json.dumps({"criterion": criterion})
         result = run("fuse", "--rule", "arithmetic_average", "--params", params, stdin=json.dumps(data))
         assert result.exit_code == 0, result.stderr
-        found: list[float] = strict_json(result.stdout)["weights"]
-        return found
+        given: list[float] = strict_json(result.stdout)["weights"]
+        return given
 
     likely = [{**FIRST, "likelihood": 3}, {**SECOND, "likelihood": 1}]
     assert weights("likelihood", {"tracks": likely}) == pytest.approx([0.75, 0.25])
@@ -353,7 +353,7 @@ def greedy(monkeypatch: pytest.MonkeyPatch) -> list[SourceTracks]:
         return FusedTracks(tracks.mean[0], tracks.cov[0], dof=np.array(np.inf), info=info)
 
     rule = Rule("greedy", "Greedy", fuse, NoParams, "gaussian", "n_ary", "none", "", "", "", needs=NEEDS)
-    monkeypatch.setitem(RULES, "greedy", rule)
+    monkeypatch.setitem(RULES.own, "greedy", rule)
     return given
 
 
@@ -377,7 +377,7 @@ def test_extras_reach_the_rule_as_arrays(greedy: list[SourceTracks]) -> None:
 
 def test_optional_extras_may_be_left_out(monkeypatch: pytest.MonkeyPatch, greedy: list[SourceTracks]) -> None:
     modest = dataclasses.replace(RULES["greedy"], needs=(), optional=NEEDS)
-    monkeypatch.setitem(RULES, "greedy", modest)
+    monkeypatch.setitem(RULES.own, "greedy", modest)
     for data in ({"tracks": PAIR}, {"tracks": PAIR, "seed": 3}, GREEDY):
         result = run("fuse", "--rule", "greedy", stdin=json.dumps(data))
         assert result.exit_code == 0, result.stderr
@@ -449,7 +449,7 @@ def test_a_result_that_is_not_finite_is_refused(greedy: list[SourceTracks], monk
     def overflow(tracks: SourceTracks, params: NoParams) -> FusedTracks:
         return FusedTracks(tracks.mean[0] * np.inf, tracks.cov[0])
 
-    monkeypatch.setitem(RULES, "greedy", dataclasses.replace(RULES["naive"], fuse=overflow))
+    monkeypatch.setitem(RULES.own, "greedy", dataclasses.replace(RULES["naive"], fuse=overflow))
     with np.errstate(invalid="ignore"):
         line = refused({"tracks": [SECOND]}, rule="greedy")
     assert line == "The fused mean or covariance is not finite: the tracks are too extreme for this rule."

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,35 +29,82 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def package(examples: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make the page's package of the rule, in place: its folder is what an interpreter needs to find it."""
+    pytest.importorskip("setuptools")
+    folder = tmp_path_factory.mktemp("package")
+    (description,) = re.findall(r"```toml\n(.*?)```", (ROOT / "doc" / "add-a-rule.md").read_text(), re.DOTALL)
+    (folder / "pyproject.toml").write_text(description, encoding="utf-8")
+    (folder / "best_track.py").write_bytes((examples / "best_track.py").read_bytes())
+    build = [sys.executable, "-W", "ignore", "-c", "from setuptools import setup; setup()", "-q", "egg_info"]
+    subprocess.run(build, cwd=folder, check=True, timeout=60)
+    return folder
+
+
 @pytest.fixture(autouse=True)
 def registry() -> Iterator[None]:
     """Forget the rules that files bring, for other tests."""
     before = set(RULES)
     yield
     for key in RULES.keys() - before:
-        del RULES[key]
+        del RULES.own[key]
 
 
-def pages_commands(page: str) -> list[str]:
-    text = (ROOT / "doc" / f"{page}.md").read_text(encoding="utf-8")
-    return re.findall(r"^track-fusion (.*)$", text, re.MULTILINE)
+#: The parts of the pages before and behind this heading: with files of one's own, and with a package installed.
+SHIPPED = "## Ship it as a package"
+PAGES = [("add-a-rule", 0, 3), ("add-a-rule", 1, 2), ("add-a-scenario", 0, 2)]
 
 
-@pytest.mark.parametrize("page", ["add-a-rule", "add-a-scenario"])
-def test_the_commands_of_the_page_run(page: str, examples: Path, tmp_path: Path) -> None:
-    commands = pages_commands(page)
-    assert len(commands) == 2
+@pytest.mark.parametrize(("page", "part", "count"), PAGES, ids=str)
+def test_the_commands_of_the_page_run(
+    page: str, part: int, count: int, examples: Path, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    text = (ROOT / "doc" / f"{page}.md").read_text(encoding="utf-8").split(SHIPPED)[part]
+    commands = re.findall(r"^track-fusion (.*)$", text, re.MULTILINE)
+    assert len(commands) == count
+    installed = [str(request.getfixturevalue("package"))] if part else []
+    env = {"PYTHONPATH": os.pathsep.join([*installed, os.environ.get("PYTHONPATH", "")])}
     (tmp_path / "tracks.json").write_text('{"tracks": [{"mean": [1], "cov": [[4]]}, {"mean": [2], "cov": [[1]]}]}')
     for command in commands:
         words, _, source = command.partition(" < ")
         given = words.replace("./", f"{examples}/").split()
-        given += ["--runs", "40"] if given[0] != "fuse" else []
+        given += ["--runs", "40"] if given[0] in ("compare", "reproduce") else []
         given += ["--out", str(tmp_path)] if given[0] == "reproduce" else []
-        done = run_process(*given, stdin=(tmp_path / source).read_text() if source else "")
+        done = run_process(*given, stdin=(tmp_path / source).read_text() if source else "", env=env)
         assert done.returncode == 0, (command, done.stderr)
         assert done.stdout
         if given[0] == "fuse":
             assert strict_json(done.stdout)["mean"] == [2.0]
+
+
+def test_the_shipped_rule_is_listed_and_keeps_every_law(package: Path) -> None:
+    env = {"PYTHONPATH": os.pathsep.join([str(package), os.environ.get("PYTHONPATH", "")])}
+    listed = strict_json(run_process("rules", "--json", env=env).stdout)
+    assert [r["key"] for r in listed] == [*RULES, "best_track"]
+    answer = strict_json(run_process("rules", "--check", "best_track:RULE", "--json", env=env).stdout)
+    assert answer["rule"] == "best_track"
+    outcomes = {law["law"]: law["outcome"] for law in answer["laws"]}
+    assert outcomes.pop("counter_example") == "skipped"
+    assert set(outcomes.values()) == {"passed"}
+
+
+def test_a_rule_that_breaks_a_law_fails_the_check(examples: Path, tmp_path: Path) -> None:
+    text = (examples / "best_track.py").read_text().replace("FusedTracks(mean, cov,", "FusedTracks(mean, 0.5 * cov,")
+    (tmp_path / "sharp.py").write_text(text.replace('key="best_track"', 'key="sharp"'))
+    result = run("rules", "--check", str(tmp_path / "sharp.py"), "--json")
+    assert result.exit_code == 1
+    laws = {law["law"]: law for law in strict_json(result.stdout)["laws"]}
+    assert {name for name, law in laws.items() if law["outcome"] == "failed"} == {"copies_of_a_track", "guarantee"}
+    assert laws["guarantee"]["text"] == (
+        "2 tracks, parameters {}: error variance over the claimed one: expected at most 1, got 2."
+    )
+    assert re.search(r"guarantee +failed +2 tracks", run("rules", "--check", str(tmp_path / "sharp.py")).stdout)
+
+
+def test_what_cannot_be_checked_is_refused() -> None:
+    assert "Did you mean 'naive'" in refusal(run("rules", "--check", "niave"))
+    assert "There is no 'no_such:RULE'" in refusal(run("rules", "--check", "no_such:RULE"))
 
 
 def test_the_own_scenario_is_judged(examples: Path, tmp_path: Path) -> None:
@@ -72,9 +122,9 @@ def test_the_own_scenario_is_judged(examples: Path, tmp_path: Path) -> None:
 def compared(*words: str) -> dict[str, Any]:
     result = run("compare", *words, "--json")
     assert result.exit_code == 0, result.stderr
-    found = strict_json(result.stdout)
-    assert isinstance(found, dict)
-    return found
+    answer = strict_json(result.stdout)
+    assert isinstance(answer, dict)
+    return answer
 
 
 def test_rules_are_compared_under_the_same_noise(examples: Path) -> None:
@@ -103,6 +153,7 @@ def test_parameters_are_given_by_rule(examples: Path) -> None:
     assert means[0] != means[1]
 
 
+@pytest.mark.slow
 def test_the_figures_depend_on_the_seed_alone(examples: Path) -> None:
     words = (str(examples / "two_thermometers.py"), "--rules", "naive", "--runs", "1100")
     assert compared(*words, "--jobs", "1") == compared(*words, "--jobs", "3")
@@ -170,7 +221,7 @@ def test_an_interrupted_study_goes_on(examples: Path, tmp_path: Path) -> None:
     kept[0].unlink()
     with np.load(kept[1]) as arrays:
         changed = {name: arrays[name] for name in arrays.files}
-    changed["sample/given-naive"] = np.full_like(changed["sample/given-naive"], 100.0)
+    changed["outcome/given-naive"] = np.full_like(changed["outcome/given-naive"], 100.0)
     before = kept[2].stat().st_mtime_ns
     assert run(*words, "--runs", "2000").stdout == whole
     np.savez(kept[1], **changed)

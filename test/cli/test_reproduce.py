@@ -29,25 +29,27 @@ from track_fusion.metrics.accuracy import Estimate
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.scenario import Claim, Scenario
 
-def sample(runs, seed, progress, only=""):
+def simulate(runs, seed, progress, only=""):
     Path(__file__).with_suffix(f".asked-{seed}-{runs.start}-{runs.stop}").touch()
     return {"heads": np.arange(runs.start, runs.stop) + seed}
 
-def figures(samples):
-    runs = len(samples["heads"])
+def figures(outcomes):
+    runs = len(outcomes["heads"])
     return {
         "kf-alone/error_m": Estimate(1.0, 0.01, runs),
         "kf-ic/error_m": Estimate(9.0, 0.01, runs),
         "kf-naive/error_m": Estimate(2.0, float("nan"), runs),
-        "kf-sum/heads_1": Estimate.exact(samples["heads"].sum()),
+        "kf-sum/heads_1": Estimate.exact(outcomes["heads"].sum()),
     }
 
-def charts(samples):
+def charts(outcomes):
     return [Chart("Heads & <tails>", "run", "1", (Series("heads", np.arange(3.0), np.array([1.0, np.nan, 2.0])),))]
 
 SCENARIO = Scenario(
-    "NAME", "A fair <coin>", "Nobody", "nothing", {"kf-alone/error_m": 1.01, "kf-ic/error_m": 0.5}, 10, RUNS, 900,
-    ("it is fair",), sample, figures, charts, (
+    key="NAME", title="A fair <coin>", paper="Nobody", shows="nothing",
+    simulate=simulate, figures=figures, charts=charts,
+    published={"kf-alone/error_m": 1.01, "kf-ic/error_m": 0.5}, published_runs=10, default_runs=RUNS,
+    publication_runs=900, assumptions=("it is fair",), claims=(
         Claim("heads & tails are rare", "Fig. 1", ("kf-sum/heads_1",), lambda e: e.value < 0),
         Claim.order("naive lies between", "Fig. 2", "kf-alone/error_m", "kf-naive/error_m", "kf-ic/error_m"),
         Claim.order("nobody measured it", "Fig. 3", "kf-alone/error_m", "kf-nobody/error_m"),
@@ -120,6 +122,7 @@ def test_of_one_run_the_error_is_not_known() -> None:
     assert {f["verdict"] for f in answer["figures"]} == {"not given"}
 
 
+@pytest.mark.slow
 def test_without_runs_the_scenario_decides(files: Coin) -> None:
     assert reproduced(files.coin)["runs"] == 30
     assert files.asked() == {"coin.asked-0-0-20", "coin.asked-0-20-30"}
@@ -132,6 +135,7 @@ def test_several_names_give_a_list_each_once(files: Coin) -> None:
     assert len(files.asked()) == 5
 
 
+@pytest.mark.slow
 def test_no_figure_depends_on_the_number_of_processes(tmp_path: Path) -> None:
     texts = []
     for jobs in ("1", "3"):
@@ -189,11 +193,11 @@ class Page(HTMLParser):
 def test_the_page_is_whole_and_asks_for_nothing_from_outside(files: Coin) -> None:
     assert run("reproduce", files.coin, files.dice, "--out", "here").exit_code == 0
     text = Path("here/report.html").read_text(encoding="utf-8")
-    found = Page(text)
-    assert found.open == []
-    assert {r for r in found.references if not r.startswith("data:")} == {"#coin", "#dice"}
+    page = Page(text)
+    assert page.open == []
+    assert {r for r in page.references if not r.startswith("data:")} == {"#coin", "#dice"}
     assert "url(" not in text
-    words = " ".join(found.words)
+    words = " ".join(page.words)
     for wanted in (
         "A fair <coin>",
         "1.000 ± 0.010",
@@ -203,7 +207,7 @@ def test_the_page_is_whole_and_asks_for_nothing_from_outside(files: Coin) -> Non
         "it is fair",
     ):
         assert wanted in words
-    (picture, _) = [r for r in found.references if r.startswith("data:image/svg+xml")]
+    (picture, _) = [r for r in page.references if r.startswith("data:image/svg+xml")]
     image = base64.b64decode(picture.partition(",")[2]).decode()
     assert ElementTree.fromstring(image).tag == "{http://www.w3.org/2000/svg}svg"
     assert "Heads &amp; &lt;tails&gt;" in image
@@ -251,6 +255,7 @@ def test_wrong_options_are_refused(words: tuple[str, ...], line: str, files: Coi
     assert files.asked() == set()
 
 
+@pytest.mark.slow
 def test_progress_with_time_left_is_shown_on_a_terminal_only(tmp_path: Path) -> None:
     ours, theirs = pty.openpty()
     shown: list[bytes] = []

@@ -2,11 +2,16 @@
 
 import numpy as np
 import pytest
+from oracles import kalman
 from scipy.stats import chi2, multivariate_normal
 
-from track_fusion.filters import kalman
-from track_fusion.filters import probabilistic_data_association as pda
-from track_fusion.filters.probabilistic_data_association import ClutterParams
+from track_fusion.filters.probabilistic_data_association import (
+    Candidate,
+    ClutterParams,
+    ProbabilisticDataAssociation,
+    Scan,
+    update_existence,
+)
 from track_fusion.models.measurement import LinearSensor, RangeBearingSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.trackers.many_targets import PdaTracker, PdaTrackerParams
@@ -14,8 +19,15 @@ from track_fusion.tracks import planar_layout
 
 LAYOUT = planar_layout()
 SENSOR = LinearSensor.position(LAYOUT, 3.0)
+MOTION = NearlyConstantVelocity(LAYOUT, MotionParams(process_noise=10.0))
 MEAN, COV = np.array([10.0, -5.0, 4.0, 3.0]), np.diag([20.0, 12.0, 4.0, 4.0]) + 1.0
 ALL = np.ones(1, bool)
+
+
+def update(mean, cov, zs, present, sensor, params, existence=0.5):
+    """Posterior, and what was learned, of targets that exist with a probability."""
+    state = Candidate(mean, cov, np.asarray(existence))
+    return ProbabilisticDataAssociation(params).update(state, Scan(zs, present), sensor)
 
 
 def hypotheses(zs, existence, detection, density, volume=1000.0):
@@ -43,38 +55,38 @@ def test_update_and_existence_are_the_moments_over_all_hypotheses(count, detecti
     whole = share @ np.array(mean[1:])
     spread = sum(w * (c + np.outer(m - whole, m - whole)) for w, m, c in zip(share, mean[1:], cov[1:], strict=True))
     params = ClutterParams(detection_probability=detection, gate_probability=1.0, clutter_density=0.02)
-    found_mean, found_cov, found = pda.update(MEAN, COV, zs, np.ones(count, bool), SENSOR, params)
-    np.testing.assert_allclose(found_mean, whole, rtol=1e-10)
-    np.testing.assert_allclose(found_cov, spread, rtol=1e-9, atol=1e-10)
-    np.testing.assert_allclose(found.weight, np.roll(share, -1), rtol=1e-9, atol=1e-15)
-    assert pda.update_existence(np.array(existence), found.log_ratio) == pytest.approx(1 - weight[0], rel=1e-10)
+    posterior, learned = update(MEAN, COV, zs, np.ones(count, bool), SENSOR, params, existence)
+    np.testing.assert_allclose(posterior.mean, whole, rtol=1e-10)
+    np.testing.assert_allclose(posterior.cov, spread, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(learned.weight, np.roll(share, -1), rtol=1e-9, atol=1e-15)
+    assert posterior.existence == pytest.approx(1 - weight[0], rel=1e-10)
 
 
 def test_one_sure_detection_is_the_kalman_filter():
     z = np.array([[12.0, -4.0]])
     params = ClutterParams(detection_probability=1.0, gate_probability=1.0, clutter_density=1e-30)
-    found = pda.update(MEAN, COV, z, ALL, SENSOR, params)
+    posterior, _ = update(MEAN, COV, z, ALL, SENSOR, params)
     wanted = kalman.update(MEAN, COV, z[0], SENSOR.matrix, SENSOR.noise)
-    np.testing.assert_allclose(found[0], wanted[0], rtol=1e-12)
-    np.testing.assert_allclose(found[1], wanted[1], rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(posterior.mean, wanted[0], rtol=1e-12)
+    np.testing.assert_allclose(posterior.cov, wanted[1], rtol=1e-11, atol=1e-12)
 
 
 def test_detections_outside_the_gate_and_padding_change_nothing():
     zs, params = np.array([[12.0, -4.0], [200.0, 0.0], [9.0, -6.0]]), ClutterParams()
-    whole = pda.update(MEAN, COV, zs, np.array([True, True, False]), SENSOR, params)
-    alone = pda.update(MEAN, COV, zs[:1], ALL, SENSOR, params)
-    np.testing.assert_allclose(whole[0], alone[0], rtol=1e-13)
-    np.testing.assert_allclose(whole[1], alone[1], rtol=1e-12)
-    np.testing.assert_array_equal(whole[2].gated, [True, False, False])
-    assert whole[2].log_ratio == pytest.approx(float(alone[2].log_ratio))
+    whole, learned = update(MEAN, COV, zs, np.array([True, True, False]), SENSOR, params)
+    alone, learned_alone = update(MEAN, COV, zs[:1], ALL, SENSOR, params)
+    np.testing.assert_allclose(whole.mean, alone.mean, rtol=1e-13)
+    np.testing.assert_allclose(whole.cov, alone.cov, rtol=1e-12)
+    np.testing.assert_array_equal(learned.gated, [True, False, False])
+    assert learned.log_ratio == pytest.approx(float(learned_alone.log_ratio))
 
 
 def test_the_gate_holds_its_share_of_the_targets_detections():
     rng, params = np.random.default_rng(0), ClutterParams(gate_probability=0.9)
     spread = SENSOR.matrix @ COV @ SENSOR.matrix.T + SENSOR.noise
     zs = rng.multivariate_normal(MEAN[:2], spread, 20_000)
-    found = pda.update(MEAN, COV, zs, np.ones(len(zs), bool), SENSOR, params)[2]
-    assert found.gated.mean() == pytest.approx(0.9, abs=0.01)
+    _, learned = update(MEAN, COV, zs, np.ones(len(zs), bool), SENSOR, params)
+    assert learned.gated.mean() == pytest.approx(0.9, abs=0.01)
 
 
 @pytest.mark.parametrize("lead", [(), (1,), (3, 2), (0,)])
@@ -83,18 +95,19 @@ def test_batch_equals_loop(lead):
     mean, cov = MEAN + rng.normal(size=(*lead, 4)), np.broadcast_to(COV, (*lead, 4, 4))
     zs = sensor.observe(mean)[..., None, :] + rng.normal(size=(*lead, 3, 2)) * [8.0, 0.1]
     present, params = rng.random((*lead, 3)) < 0.7, ClutterParams(clutter_density=0.01)
-    whole = pda.update(mean, cov, zs, present, sensor, params)
-    assert whole[2].log_ratio.shape == lead
+    whole, learned = update(mean, cov, zs, present, sensor, params)
+    assert learned.log_ratio.shape == lead
     for i in np.ndindex(lead):
-        alone = pda.update(mean[i], cov[i], zs[i], present[i], sensor, params)
-        for a, b in ((whole[0][i], alone[0]), (whole[1][i], alone[1]), (whole[2].weight[i], alone[2].weight)):
+        alone, single = update(mean[i], cov[i], zs[i], present[i], sensor, params)
+        for a, b in ((whole.mean[i], alone.mean), (whole.cov[i], alone.cov), (learned.weight[i], single.weight)):
             np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
 
 
 def test_existence_fades_without_detections_and_survives_huge_ratios():
     params = ClutterParams(survival_probability=0.9)
-    assert pda.predict_existence(np.array(0.5), params) == pytest.approx(0.45)
-    found = pda.update_existence(np.array([0.5, 0.5, 0.0, 1.0]), np.array([1e4, -1e4, 50.0, -50.0]))
+    state = Candidate(MEAN, COV, np.array(0.5))
+    assert ProbabilisticDataAssociation(params).predict(state, MOTION.over(SCAN_S)).existence == pytest.approx(0.45)
+    found = update_existence(np.array([0.5, 0.5, 0.0, 1.0]), np.array([1e4, -1e4, 50.0, -50.0]))
     np.testing.assert_allclose(found, [1.0, 0.0, 0.0, 1.0], atol=1e-12)
 
 
@@ -118,8 +131,7 @@ def scene(rng, steps, last_of_third=15):
 
 
 def tracker(**changes):
-    motion = NearlyConstantVelocity(LAYOUT, MotionParams(process_noise=10.0))
-    return PdaTracker(motion, RADAR, "map", PdaTrackerParams(clutter_density=DENSITY, **changes))
+    return PdaTracker(MOTION, RADAR, "map", PdaTrackerParams(clutter_density=DENSITY, **changes))
 
 
 def test_targets_are_found_tracked_and_given_up_in_clutter():
@@ -192,8 +204,7 @@ def test_bearings_may_be_counted_from_zero_to_two_pi():
     assert np.ptp(np.sign(seen[:, 1])) == 2.0
     batches = []
     for turn in (0.0, 2.0 * np.pi):
-        motion = NearlyConstantVelocity(LAYOUT, MotionParams(process_noise=10.0))
-        one = PdaTracker(motion, sensor, "map", PdaTrackerParams(clutter_density=DENSITY))
+        one = PdaTracker(MOTION, sensor, "map", PdaTrackerParams(clutter_density=DENSITY))
         for k, z in enumerate(seen):
             batch = one.step(int(k * SCAN_S * 1e9), np.array([[z[0], z[1] % (2 * np.pi) if turn else z[1]]]))
         batches.append(batch)
@@ -211,7 +222,7 @@ def test_the_search_misses_no_detection_in_a_gate(reach_m):
     cov = a @ np.swapaxes(a, 1, 2)
     values = rng.uniform([0.0, -np.pi], [1.5 * reach_m, np.pi], (300, 2))
     present = np.ones((40, 300), bool)
-    gated = pda.update(mean, cov, np.tile(values, (40, 1, 1)), present, RADAR, one.params)[2].gated
+    gated = update(mean, cov, np.tile(values, (40, 1, 1)), present, RADAR, one.params)[1].gated
     found = np.zeros_like(gated)
     found[one._near(mean, cov, values)] = True
     assert gated.any()

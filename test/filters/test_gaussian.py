@@ -4,12 +4,16 @@ import itertools
 
 import numpy as np
 import pytest
+from filters.plain import Plain, update
 from mpmath import mp
 from scipy.linalg import block_diag
 from scipy.stats import chi2, multivariate_normal
 
-from track_fusion.filters import cubature, extended, iterated_corrector, square_root_cubature, unscented
-from track_fusion.filters.kalman import update_joint
+from track_fusion.filters.cubature import Cubature
+from track_fusion.filters.extended import Extended
+from track_fusion.filters.iterated_corrector import IteratedCorrector
+from track_fusion.filters.square_root_cubature import GaussianRoot, SquareRootCubature, triangular_root
+from track_fusion.filters.unscented import Unscented, UnscentedParams
 from track_fusion.models.base import Transition
 from track_fusion.models.measurement import LinearSensor, RangeBearingSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
@@ -19,21 +23,12 @@ from track_fusion.tracks import StateLayout, planar_layout
 N = 4
 
 
-class Root:
-    """The square-root filter seen from outside: covariances in, covariances out."""
-
-    @staticmethod
-    def predict(mean, cov, transition):
-        mean, root = square_root_cubature.predict(mean, np.linalg.cholesky(cov), transition)
-        return mean, root @ np.swapaxes(root, -1, -2)
-
-    @staticmethod
-    def update(mean, cov, z, sensor):
-        mean, root, innovation = square_root_cubature.update(mean, np.linalg.cholesky(cov), z, sensor)
-        return mean, root @ np.swapaxes(root, -1, -2), innovation
-
-
-FILTERS = {"extended": extended, "unscented": unscented, "cubature": cubature, "root": Root}
+FILTERS = {
+    "extended": Plain(Extended()),
+    "unscented": Plain(Unscented()),
+    "cubature": Plain(Cubature()),
+    "root": Plain(SquareRootCubature()),
+}
 SIGMA = {name: FILTERS[name] for name in ("unscented", "cubature", "root")}
 
 
@@ -79,12 +74,13 @@ def test_one_sensor_after_the_other_equals_the_joint_update_when_linear(name):
     mean, cov = rng.normal(size=(6, N)), random_cov(rng, 6, N)
     hs, rs = [rng.normal(size=(m, N)) for m in (1, 2)], [random_cov(rng, m) for m in (1, 2)]
     zs = [rng.normal(size=(6, m)) for m in (1, 2)]
-    joint = update_joint(mean, cov, zs, hs, rs)
+    joint = update(mean, cov, np.concatenate(zs, -1), np.concatenate(hs), block_diag(*rs))
     sensors = [LinearSensor(tuple("ab"[: len(r)]), h, r) for h, r in zip(hs, rs, strict=True)]
-    found = iterated_corrector.update(mean, cov, zs, sensors, FILTERS[name].update)
-    np.testing.assert_allclose(found[0], joint[0], rtol=1e-8, atol=1e-10)
-    np.testing.assert_allclose(found[1], joint[1], rtol=1e-7, atol=1e-10)
-    np.testing.assert_allclose(found[2], joint[2].log_likelihood, rtol=1e-9)
+    one = FILTERS[name].one
+    posterior, learned = IteratedCorrector(one).update(one.begin(mean, cov), zs, sensors)
+    np.testing.assert_allclose(posterior.moments[0], joint[0], rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(posterior.moments[1], joint[1], rtol=1e-7, atol=1e-10)
+    np.testing.assert_allclose(learned.log_likelihood, joint[2].log_likelihood, rtol=1e-9)
 
 
 def quadrature(mean, cov, order=30):
@@ -115,9 +111,9 @@ def test_unscented_with_three_minus_n_gets_the_variance_of_a_square():
     """In one axis kappa = 2 makes the points those of Gauss-Hermite of order 3: x^2 has variance 4 m^2 P + 2 P^2."""
     mean, cov = np.array([1.5]), np.array([[0.7]])
     square = Transition.additive(lambda x: x**2, lambda x: 2 * x[..., None], np.array([[0.3]]), np.array([[1.0]]))
-    _, found = unscented.predict(mean, cov, square, unscented.UnscentedParams(kappa=2.0))
+    _, found = Plain(Unscented(UnscentedParams(kappa=2.0))).predict(mean, cov, square)
     assert found[0, 0] == pytest.approx(4 * 1.5**2 * 0.7 + 2 * 0.7**2 + 0.3, rel=1e-12)
-    _, too_small = cubature.predict(mean, cov, square)
+    _, too_small = FILTERS["cubature"].predict(mean, cov, square)
     assert too_small[0, 0] == pytest.approx(4 * 1.5**2 * 0.7 + 0.3, rel=1e-12)
 
 
@@ -125,18 +121,15 @@ def test_unscented_without_a_centre_is_the_cubature_filter():
     rng = np.random.default_rng(3)
     layout = planar_layout()
     mean, cov = np.array([300.0, 200.0, 1.0, 2.0]), 20.0 * random_cov(rng, N)
-    sensor, params = RangeBearingSensor(layout, 5.0, 0.1), unscented.UnscentedParams(kappa=0.0)
-    a, b = (
-        unscented.update(mean, cov, np.array([350.0, 0.6]), sensor, params),
-        cubature.update(mean, cov, np.array([350.0, 0.6]), sensor),
-    )
+    sensor, centreless = RangeBearingSensor(layout, 5.0, 0.1), Plain(Unscented(UnscentedParams(kappa=0.0)))
+    a, b = (one.update(mean, cov, np.array([350.0, 0.6]), sensor) for one in (centreless, FILTERS["cubature"]))
     np.testing.assert_allclose(a[0], b[0], rtol=1e-12)
     np.testing.assert_allclose(a[1], b[1], rtol=1e-11, atol=1e-11)
 
 
 def test_unscented_refuses_points_on_top_of_each_other():
     with pytest.raises(ValueError, match="The 'kappa' parameter must exceed -n = -3. Got -3."):
-        unscented.points(3, unscented.UnscentedParams(kappa=-3.0))
+        Unscented(UnscentedParams(kappa=-3.0)).points(3)
 
 
 @pytest.mark.parametrize("name", SIGMA)
@@ -234,17 +227,16 @@ def test_the_root_survives_where_the_covariance_does_not():
     """Two axes almost equal (1 - 1e-14 correlated) and a sharp sensor: condition 1e22, beyond a matrix of doubles."""
     root = np.array([[1e6, 0.0, 0.0], [1e6, 0.1, 0.0], [3.0, -2.0, 1e-3]])
     sensor = LinearSensor(("a",), np.array([[1.0, 0.0, 0.0]]), np.array([[1e-6]]))
-    mean, z = np.zeros(3), np.zeros(1)
-    found = root
+    z, state = np.zeros(1), GaussianRoot(np.zeros(3), root)
     for _ in range(5):
-        mean, found, _ = square_root_cubature.update(mean, found, z, sensor)
+        state, _ = SquareRootCubature().update(state, z, sensor)
     mp.dps = 60
     exact = mp.matrix(root.tolist())
     exact = exact * exact.T
     column = exact[:, 0]
     exact = exact - column * column.T / (exact[0, 0] + mp.mpf(1e-6) / 5)
     variances = np.array([float(exact[i, i]) for i in range(3)])
-    np.testing.assert_allclose((found**2).sum(1), variances, rtol=1e-5)
+    np.testing.assert_allclose((state.root**2).sum(1), variances, rtol=1e-5)
     # As a matrix of doubles the same covariance has lost its smallest axis already.
     lost = np.linalg.eigvalsh(root @ root.T)[0]
     assert not lost == pytest.approx(np.linalg.svd(root, compute_uv=False)[-1] ** 2, rel=0.1)
@@ -253,7 +245,7 @@ def test_the_root_survives_where_the_covariance_does_not():
 def test_sharp_updates_keep_the_covariance_definite():
     cov, sensor = np.diag([1e8, 1e8, 1e4, 1e4]), LinearSensor(("x", "y"), np.eye(2, N), 1e-6 * np.eye(2))
     wanted = exact_variances(cov, sensor, 20)
-    for one in (cubature, Root):
+    for one in (FILTERS["cubature"], FILTERS["root"]):
         mean, posterior = np.zeros(N), cov
         for _ in range(20):
             mean, posterior, _ = one.update(mean, posterior, np.zeros(2), sensor)
@@ -264,7 +256,7 @@ def test_sharp_updates_keep_the_covariance_definite():
 def test_triangular_root():
     rng = np.random.default_rng(5)
     wide = rng.normal(size=(3, 4, 7))
-    root = square_root_cubature.triangular_root(wide)
+    root = triangular_root(wide)
     np.testing.assert_allclose(root @ np.swapaxes(root, -1, -2), wide @ np.swapaxes(wide, -1, -2), rtol=1e-12)
     np.testing.assert_array_equal(np.triu(root, 1), np.zeros_like(root))
     assert (np.diagonal(root, axis1=1, axis2=2) > 0).all()

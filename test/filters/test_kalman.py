@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from filters.plain import predict, update
 from scipy.linalg import block_diag
 from scipy.stats import chi2, multivariate_normal
 
-from track_fusion.filters.kalman import predict, update, update_joint
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.tracks import planar_layout
@@ -64,7 +64,7 @@ def test_joint_update_equals_one_sensor_after_the_other():
     hs = [rng.normal(size=(m, N)) for m in (1, 2, 3)]
     rs = [random_cov(rng, m) for m in (1, 2, 3)]
     zs = [rng.normal(size=(6, m)) for m in (1, 2, 3)]
-    joint_mean, joint_cov, innovation = update_joint(mean, cov, zs, hs, rs)
+    joint_mean, joint_cov, innovation = update(mean, cov, np.concatenate(zs, -1), np.concatenate(hs), block_diag(*rs))
     total = np.zeros(6)
     for z, h, r in zip(zs, hs, rs, strict=True):
         mean, cov, one = update(mean, cov, z, h, r)

@@ -4,13 +4,12 @@ import itertools
 
 import numpy as np
 import pytest
+from oracles import kalman
 from scipy.stats import multivariate_normal
 
 from track_fusion.densities.mixture.mixture import Mixture
-from track_fusion.filters import gaussian_sum_modes, kalman
-from track_fusion.filters import interacting_multiple_model as imm
-from track_fusion.filters.gaussian_sum_modes import MixtureModes
-from track_fusion.filters.interacting_multiple_model import Modes
+from track_fusion.filters.gaussian_sum_modes import GaussianSumModes, MixtureModes
+from track_fusion.filters.interacting_multiple_model import InteractingMultipleModel, Modes
 from track_fusion.models.measurement import LinearSensor, RangeRangeRateSensor
 from track_fusion.models.turn import KnownTurn, KnownTurnParams
 from track_fusion.tracks import planar_layout
@@ -24,6 +23,7 @@ START = np.array([0.5, 0.3, 0.2])
 SENSOR = LinearSensor.position(LAYOUT, 2.0)
 MEAN, COV = np.array([10.0, -5.0, 4.0, 3.0]), np.diag([9.0, 9.0, 4.0, 4.0])
 SEEN = np.array([[14.5, -1.0], [17.0, 2.5], [16.0, 8.0]])
+IMM = InteractingMultipleModel(CHAIN)
 
 
 def keep_all(mixture, count):
@@ -61,11 +61,10 @@ def enumerated(steps, jump_first):
 @pytest.mark.parametrize("steps", [1, 2, 3])
 def test_gaussian_sums_without_reduction_are_the_exact_posterior(steps, jump_first):
     modes = MixtureModes(START, Mixture(np.ones((3, 1)), np.tile(MEAN, (3, 1, 1)), np.tile(COV, (3, 1, 1, 1))))
-    total = 0.0
+    one, total = GaussianSumModes(CHAIN, 3**steps, keep_all, jump_first), 0.0
     for z in SEEN[:steps]:
-        modes = gaussian_sum_modes.predict(modes, TRANSITIONS, CHAIN, 3**steps, keep_all, jump_first)
-        modes, likelihood = gaussian_sum_modes.update(modes, z, SENSOR)
-        total += likelihood
+        modes, learned = one.update(one.predict(modes, TRANSITIONS), z, SENSOR)
+        total += learned.log_likelihood
     evidence, probability, mean, cov = enumerated(steps, jump_first)
     assert total == pytest.approx(evidence, rel=1e-10)
     np.testing.assert_allclose(modes.probability, probability, rtol=1e-9)
@@ -77,7 +76,7 @@ def test_gaussian_sums_without_reduction_are_the_exact_posterior(steps, jump_fir
 @pytest.mark.parametrize("jump_first", [True, False])
 def test_first_step_of_the_imm_is_exact_in_its_moments(jump_first):
     """From one Gaussian: with the jump first every mode stays Gaussian; else the merging keeps all first moments."""
-    modes = imm.predict(Modes.start(START, MEAN, COV), TRANSITIONS, CHAIN, jump_first)
+    modes = InteractingMultipleModel(CHAIN, jump_first).predict(Modes.start(START, MEAN, COV), TRANSITIONS)
     parts = [(START @ CHAIN[:, j], j, j) for j in range(3)] if jump_first else [
         (START[i] * CHAIN[i, j], i, j) for i in range(3) for j in range(3)
     ]  # fmt: skip
@@ -89,9 +88,9 @@ def test_first_step_of_the_imm_is_exact_in_its_moments(jump_first):
     np.testing.assert_allclose(modes.moments[0], mean, rtol=1e-12)
     np.testing.assert_allclose(modes.moments[1], cov, rtol=1e-12, atol=1e-12)
     if jump_first:
-        modes, likelihood = imm.update(modes, SEEN[0], SENSOR)
+        modes, learned = IMM.update(modes, SEEN[0], SENSOR)
         evidence, probability, mean, cov = enumerated(1, True)
-        assert likelihood == pytest.approx(evidence, rel=1e-11)
+        assert learned.log_likelihood == pytest.approx(evidence, rel=1e-11)
         np.testing.assert_allclose(modes.probability, probability, rtol=1e-10)
         np.testing.assert_allclose(modes.moments[1], cov, rtol=1e-9)
 
@@ -99,7 +98,7 @@ def test_first_step_of_the_imm_is_exact_in_its_moments(jump_first):
 def test_imm_stays_near_the_enumeration():
     modes = Modes.start(START, MEAN, COV)
     for z in SEEN:
-        modes, _ = imm.update(imm.predict(modes, TRANSITIONS, CHAIN), z, SENSOR)
+        modes, _ = IMM.update(IMM.predict(modes, TRANSITIONS), z, SENSOR)
     _, probability, mean, cov = enumerated(3, True)
     np.testing.assert_allclose(modes.probability, probability, atol=0.01)
     np.testing.assert_allclose(modes.moments[0], mean, atol=0.05 * np.sqrt(cov.max()))
@@ -109,10 +108,10 @@ def test_imm_stays_near_the_enumeration():
 def test_equal_modes_are_one_kalman_filter():
     modes, mean, cov = Modes.start(START, MEAN, COV), MEAN, COV
     for z in SEEN:
-        modes, likelihood = imm.update(imm.predict(modes, [TRANSITIONS[1]] * 3, CHAIN), z, SENSOR)
+        modes, learned = IMM.update(IMM.predict(modes, [TRANSITIONS[1]] * 3), z, SENSOR)
         mean, cov = kalman.predict(mean, cov, *MOTIONS[1].matrices(1.0))
         mean, cov, innovation = kalman.update(mean, cov, z, SENSOR.matrix, SENSOR.noise)
-        assert likelihood == pytest.approx(innovation.log_likelihood, rel=1e-10)
+        assert learned.log_likelihood == pytest.approx(innovation.log_likelihood, rel=1e-10)
     np.testing.assert_allclose(modes.moments[0], mean, rtol=1e-10)
     np.testing.assert_allclose(modes.moments[1], cov, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(modes.probability, START @ np.linalg.matrix_power(CHAIN, 3), rtol=1e-10)
@@ -130,9 +129,10 @@ def test_gaussian_sums_of_one_component_are_the_imm():
 
     modes = Modes.start(START, MEAN, COV)
     sums = MixtureModes(START, Mixture(np.ones((3, 1)), modes.mean[:, None], modes.cov[:, None]))
+    one, other = InteractingMultipleModel(CHAIN, jump_first=False), GaussianSumModes(CHAIN, 1, to_one)
     for z in SEEN:
-        modes, _ = imm.update(imm.predict(modes, TRANSITIONS, CHAIN, jump_first=False), z, SENSOR)
-        sums, _ = gaussian_sum_modes.update(gaussian_sum_modes.predict(sums, TRANSITIONS, CHAIN, 1, to_one), z, SENSOR)
+        modes, _ = one.update(one.predict(modes, TRANSITIONS), z, SENSOR)
+        sums, _ = other.update(other.predict(sums, TRANSITIONS), z, SENSOR)
     np.testing.assert_allclose(sums.probability, modes.probability, rtol=1e-10)
     np.testing.assert_allclose(sums.mixture.mean[:, 0], modes.mean, rtol=1e-10)
     np.testing.assert_allclose(sums.mixture.cov[:, 0], modes.cov, rtol=1e-9, atol=1e-10)
@@ -141,9 +141,9 @@ def test_gaussian_sums_of_one_component_are_the_imm():
 @pytest.mark.parametrize("jump_first", [True, False])
 def test_reduced_by_runnalls_the_sums_stay_near_the_enumeration(jump_first):
     modes = MixtureModes(START, Mixture(np.ones((3, 1)), np.tile(MEAN, (3, 1, 1)), np.tile(COV, (3, 1, 1, 1))))
+    one = GaussianSumModes(CHAIN, 4, jump_first=jump_first)
     for z in SEEN:
-        modes = gaussian_sum_modes.predict(modes, TRANSITIONS, CHAIN, 4, jump_first=jump_first)
-        modes, _ = gaussian_sum_modes.update(modes, z, SENSOR)
+        modes, _ = one.update(one.predict(modes, TRANSITIONS), z, SENSOR)
         assert modes.mixture.weight.shape[-1] <= 4
     _, probability, mean, cov = enumerated(3, jump_first)
     np.testing.assert_allclose(modes.probability, probability, atol=5e-3)
@@ -172,8 +172,9 @@ def test_range_and_its_rate_against_a_million_samples():
     weight /= weight.sum()
     assert 1 / (weight**2).sum() > 1000
     modes = MixtureModes(START, Mixture(np.ones((3, 1)), np.tile(mean, (3, 1, 1)), np.tile(cov, (3, 1, 1, 1))))
+    one = GaussianSumModes(CHAIN, 12)
     for z in zs:
-        modes, _ = gaussian_sum_modes.update(gaussian_sum_modes.predict(modes, TRANSITIONS, CHAIN, 12), z, sensor)
+        modes, _ = one.update(one.predict(modes, TRANSITIONS), z, sensor)
     wanted = weight @ x
     spread = (weight[:, None] * (x - wanted)).T @ (x - wanted)
     np.testing.assert_allclose(modes.probability, [weight[mode == m].sum() for m in range(3)], atol=0.03)
@@ -191,7 +192,7 @@ def test_modes_are_recognised():
     for _ in range(30):
         truth = TRANSITIONS[1].advance(truth) + rng.normal(size=(runs, 4)) @ TRANSITIONS[1].noise_factor(truth).T
         z = truth[:, :2] + 2.0 * rng.normal(size=(runs, 2))
-        modes, _ = imm.update(imm.predict(modes, TRANSITIONS, CHAIN), z, SENSOR)
+        modes, _ = IMM.update(IMM.predict(modes, TRANSITIONS), z, SENSOR)
         straight, alone = kalman.predict(straight, alone, *MOTIONS[0].matrices(1.0))
         straight, alone, _ = kalman.update(straight, alone, z, SENSOR.matrix, SENSOR.noise)
         for kept, mean in zip(errors, (modes.moments[0], straight), strict=True):
@@ -206,23 +207,25 @@ def test_batch_equals_loop(lead, jump_first):
     rng, sensor = np.random.default_rng(1), RangeRangeRateSensor(LAYOUT, 5.0, 1.0, (-30.0, 4.0))
     mean, cov = MEAN + rng.normal(size=(*lead, 4)), np.broadcast_to(COV, (*lead, 4, 4))
     start, z = Modes.start(rng.dirichlet(np.ones(3), lead), mean, cov), rng.normal(size=(*lead, 2)) + [45.0, 5.0]
-    whole, likelihood = imm.update(imm.predict(start, TRANSITIONS, CHAIN, jump_first), z, sensor)
-    assert likelihood.shape == lead
+    imm = InteractingMultipleModel(CHAIN, jump_first)
+    whole, learned = imm.update(imm.predict(start, TRANSITIONS), z, sensor)
+    assert learned.log_likelihood.shape == lead
     for i in np.ndindex(lead):
         one = Modes(start.probability[i], start.mean[i], start.cov[i])
-        alone, single = imm.update(imm.predict(one, TRANSITIONS, CHAIN, jump_first), z[i], sensor)
+        alone, single = imm.update(imm.predict(one, TRANSITIONS), z[i], sensor)
         np.testing.assert_allclose(whole.probability[i], alone.probability, rtol=1e-11)
         np.testing.assert_allclose(whole.mean[i], alone.mean, rtol=1e-11)
         np.testing.assert_allclose(whole.cov[i], alone.cov, rtol=1e-10, atol=1e-12)
-        np.testing.assert_allclose(likelihood[i], single, rtol=1e-11)
+        np.testing.assert_allclose(learned.log_likelihood[i], single.log_likelihood, rtol=1e-11)
 
 
 def test_modes_that_cannot_be_reached_are_harmless():
     modes = Modes.start(np.array([1.0, 0.0, 0.0]), MEAN, COV)
     chain = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.5, 0.5, 0.0]])
-    modes, likelihood = imm.update(imm.predict(modes, TRANSITIONS, chain), SEEN[0], SENSOR)
+    imm = InteractingMultipleModel(chain)
+    modes, learned = imm.update(imm.predict(modes, TRANSITIONS), SEEN[0], SENSOR)
     np.testing.assert_array_equal(modes.probability, [1.0, 0.0, 0.0])
-    assert np.isfinite(likelihood)
+    assert np.isfinite(learned.log_likelihood)
     assert np.isfinite(modes.cov).all()
 
 
@@ -235,4 +238,4 @@ def test_modes_that_cannot_be_reached_are_harmless():
 )
 def test_malformed_chains_are_refused(chain, message):
     with pytest.raises(ValueError, match=message):
-        imm.predict(Modes.start(START, MEAN, COV), TRANSITIONS, chain)
+        InteractingMultipleModel(chain).predict(Modes.start(START, MEAN, COV), TRANSITIONS)

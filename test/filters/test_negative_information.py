@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from track_fusion.densities.mixture.mixture import Mixture
-from track_fusion.filters.negative_information import update
+from track_fusion.filters.negative_information import NegativeInformation
 from track_fusion.models.detection import SoftmaxDetector
 from track_fusion.tracks import StateLayout, planar_layout
 
@@ -16,6 +16,10 @@ PRIOR = Mixture(
     np.array([[1.5, 0.2], [-2.0, 1.0], [4.0, 3.0]]),
     np.array([[[1.0, 0.3], [0.3, 0.5]], [[2.0, 0.0], [0.0, 0.3]], [[0.2, 0.0], [0.0, 0.2]]]),
 )
+
+
+def update(mixture, detector, chance, **params):
+    return NegativeInformation(**params).update(mixture, chance, detector)
 
 
 def grid(size=241, half=9.0):
@@ -85,7 +89,7 @@ def test_moments_and_likelihood_against_a_grid(chance):
 @pytest.mark.parametrize("offset", [-3.0, 0.0, 6.0])
 def test_binary_likelihood_of_one_gaussian_against_quadrature(steepness, offset):
     """P(class 1 | x) = 1 / (1 + exp(-s (x - 1) ...)): each class' mass, mean and variance along one axis."""
-    detector = SoftmaxDetector.binary(np.array([steepness]), steepness * offset / 3.0)
+    detector = SoftmaxDetector(np.array([[0.0], [steepness]]), np.array([0.0, steepness * offset / 3.0]))
     prior = Mixture(np.ones(1), np.array([[0.5]]), np.array([[[2.0]]]))
     x = np.linspace(-15.0, 15.0, 60_001)
     normal = np.exp(-0.25 * (x - 0.5) ** 2) / np.sqrt(4 * np.pi) * (x[1] - x[0])

@@ -2,14 +2,15 @@
 
 import numpy as np
 import pytest
+from oracles import kalman
 from scipy.stats import chi2, kstest, multivariate_normal
 
-from track_fusion.filters import kalman, particle
-from track_fusion.filters.particle import RESAMPLING, Particles
+from track_fusion.filters import particle
+from track_fusion.filters.particle import RESAMPLING, Particles, Sir, SirParams, SirState
 from track_fusion.models.measurement import LinearSensor, RangeBearingSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
-from track_fusion.random_streams import exponentials, normals, stream, uniforms
+from track_fusion.random_streams import exponentials, normals, uniforms
 from track_fusion.tracks import StateLayout, planar_layout
 
 SCHEMES = pytest.mark.parametrize("scheme", RESAMPLING)
@@ -28,26 +29,32 @@ def test_many_particles_are_the_kalman_filter(scheme):
     layout, repeats = planar_layout(), 20
     motion, sensor = NearlyConstantVelocity(layout, MotionParams(process_noise=3.0)), LinearSensor.position(layout, 3.0)
     mean, cov = np.array([1.0, 2.0, 3.0, 4.0]), np.diag([20.0, 20.0, 9.0, 9.0])
-    rng = np.random.default_rng(0)
-    cloud = particle.from_gaussian(np.tile(mean, (repeats, 1)), np.tile(cov, (repeats, 1, 1)), rng, 4000)
+    one = Sir(SirParams(particles=4000, resampling=scheme))
+    cloud = one.begin(np.tile(mean, (repeats, 1)), np.tile(cov, (repeats, 1, 1)))
     for k in range(5):
         z = np.array([4.0 * k + 5.0, 5.0 * k - 2.0])
         mean, cov = kalman.predict(mean, cov, *motion.matrices(1.0))
         mean, cov, innovation = kalman.update(mean, cov, z, sensor.matrix, sensor.noise)
-        cloud, likelihood = particle.update(particle.predict(cloud, motion.over(1.0), rng), z, sensor)
-        found_mean, found_cov = particle.moments(cloud)
-        for found, wanted in ((found_mean, mean), (found_cov, cov), (likelihood, innovation.log_likelihood)):
+        cloud, learned = one.update(one.predict(cloud, motion.over(1.0)), z, sensor)
+        found_mean, found_cov = cloud.moments
+        likelihoods = learned.log_likelihood, innovation.log_likelihood
+        for found, wanted in ((found_mean, mean), (found_cov, cov), likelihoods):
             error = found.std(0, ddof=1) / np.sqrt(repeats)
             assert (np.abs(found.mean(0) - wanted) < 5 * error + 0.01 * np.abs(wanted).max()).all()
             assert (error < 0.05 * np.abs(wanted).max()).all()
-        cloud = RESAMPLING[scheme](cloud, rng)
+
+
+def weigh(cloud, z, sensor):
+    """Weighed particles, and the log-likelihood of what was seen."""
+    found, learned = Sir().update(SirState(cloud.points, cloud.log_weight, np.random.default_rng(0)), z, sensor)
+    return found, learned.log_likelihood
 
 
 def test_weights_are_the_normalised_likelihoods():
     rng = np.random.default_rng(1)
     cloud, noise = weighted(rng, 3, 50), np.array([[2.0, 0.5], [0.5, 1.0]])
     sensor, z = LinearSensor(("x", "y"), np.array([[1.0, 2.0], [0.0, 3.0]]), noise), rng.normal(size=(3, 2))
-    found, likelihood = particle.update(cloud, z, sensor)
+    found, likelihood = weigh(cloud, z, sensor)
     for r in range(3):
         each = [multivariate_normal(sensor.matrix @ x, noise).pdf(z[r]) for x in cloud.points[r]] * cloud.weight[r]
         np.testing.assert_allclose(found.weight[r], each / each.sum(), rtol=1e-9, atol=1e-300)
@@ -56,7 +63,7 @@ def test_weights_are_the_normalised_likelihoods():
 
 def test_weights_survive_where_likelihoods_underflow():
     cloud = Particles(np.array([[0.0], [1.0], [2.0]]), np.full(3, -np.log(3.0)))
-    found, likelihood = particle.update(cloud, np.array([1e4]), LinearSensor(("x",), np.eye(1), np.eye(1)))
+    found, likelihood = weigh(cloud, np.array([1e4]), LinearSensor(("x",), np.eye(1), np.eye(1)))
     np.testing.assert_allclose(found.weight, [0.0, 0.0, 1.0], atol=1e-300)
     assert likelihood == pytest.approx(-0.5 * 9998.0**2 - 0.5 * np.log(2 * np.pi) - np.log(3.0), rel=1e-12)
 
@@ -64,15 +71,8 @@ def test_weights_survive_where_likelihoods_underflow():
 def test_bearings_across_the_cut_are_near():
     sensor = RangeBearingSensor(StateLayout(("x", "y")), 1.0, 0.01)
     cloud = Particles(np.array([[-100.0, 0.5], [-100.0, -0.5], [100.0, 0.5]]), np.full(3, -np.log(3.0)))
-    weight = particle.update(cloud, np.array([100.0, np.pi]), sensor)[0].weight
+    weight = weigh(cloud, np.array([100.0, np.pi]), sensor)[0].weight
     np.testing.assert_allclose(weight, [0.5, 0.5, 0.0], atol=1e-12)
-
-
-def test_effective_sample_size_of_known_weights():
-    with np.errstate(divide="ignore"):
-        log_weight = np.log([[0.25] * 4, [1.0, 0.0, 0.0, 0.0], [0.5, 0.5, 0.0, 0.0]])
-    found = particle.effective_sample_size(Particles(np.zeros((3, 4, 1)), log_weight))
-    np.testing.assert_allclose(found, [4.0, 1.0, 2.0], rtol=1e-12)
 
 
 @SCHEMES
@@ -122,7 +122,7 @@ def test_union_is_the_mixture_of_the_sets():
     joined = particle.union(sets, weights)
     assert joined.points.shape == (3, 100, 2)
     np.testing.assert_allclose(joined.weight.sum(-1), 1.0, rtol=1e-12)
-    mean, cov = particle.moments(joined)
+    mean, cov = joined.moments
     for r in range(3):
         points = np.concatenate([s.points[r] for s in sets])
         weight = np.concatenate([w * s.weight[r] for w, s in zip(weights, sets, strict=True)])
@@ -134,7 +134,7 @@ def test_moments_keep_their_digits_far_from_the_origin():
     rng = np.random.default_rng(6)
     near = weighted(rng, 50)
     far = Particles(near.points + 2.0**30, near.log_weight)
-    np.testing.assert_allclose(particle.moments(far)[1], particle.moments(near)[1], rtol=1e-6)
+    np.testing.assert_allclose(far.moments[1], near.moments[1], rtol=1e-6)
 
 
 def steps(runs, seed=3, count=64):
@@ -142,12 +142,12 @@ def steps(runs, seed=3, count=64):
     layout = StateLayout(("x", "y", "vx", "vy", "turn_rate"))
     transition = CoordinatedTurn(layout, CoordinatedTurnParams()).over(1.0)
     sensor = RangeBearingSensor(layout, 10.0, 0.02)
-    rng = [stream(seed, run, "filter") for run in runs]
     mean, cov = np.array([300.0, 100.0, 5.0, 2.0, 0.01]), np.diag([100.0, 100.0, 4.0, 4.0, 1e-3])
-    cloud = particle.from_gaussian(np.tile(mean, (len(runs), 1)), np.tile(cov, (len(runs), 1, 1)), rng, count)
-    for scheme in RESAMPLING.values():
-        cloud, _ = particle.update(particle.predict(cloud, transition, rng), np.array([310.0, 0.3]), sensor)
-        cloud = scheme(cloud, rng)
+    ones = [Sir(SirParams(seed=seed, role="filter", particles=count, resampling=r), tuple(runs)) for r in RESAMPLING]
+    cloud = ones[0].begin(np.tile(mean, (len(runs), 1)), np.tile(cov, (len(runs), 1, 1)))
+    for one in ones:
+        cloud, _ = one.update(one.predict(cloud, transition), np.array([310.0, 0.3]), sensor)
+        cloud = one.adopt(cloud, cloud)
     return cloud.points
 
 
@@ -161,9 +161,9 @@ def test_results_do_not_depend_on_the_batch():
 
 
 def test_one_generator_serves_a_single_run():
-    rng = stream(3, 0, "filter")
-    single = particle.from_gaussian(np.zeros(2), np.eye(2), rng, 10)
-    batched = particle.from_gaussian(np.zeros((1, 2)), np.eye(2)[None], [stream(3, 0, "filter")], 10)
+    params = SirParams(seed=3, role="filter", particles=10)
+    single = Sir(params).begin(np.zeros(2), np.eye(2))
+    batched = Sir(params, (0,)).begin(np.zeros((1, 2)), np.eye(2)[None])
     np.testing.assert_array_equal(single.points, batched.points[0])
 
 

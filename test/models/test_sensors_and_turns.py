@@ -252,7 +252,6 @@ def test_local_frame_against_the_definition_of_the_ellipsoid():
     wanted = np.stack([axes @ (earth_fixed(*point) - origin) for point in points])
     found = frame.enu_from_geodetic(points)
     np.testing.assert_allclose(found, wanted, atol=1e-6)
-    np.testing.assert_allclose(frame.geodetic_from_enu(found), points, atol=1e-6)
     np.testing.assert_allclose(frame.enu_from_geodetic(points[0]), found[0], atol=1e-9)
 
 

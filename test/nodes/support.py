@@ -86,8 +86,8 @@ class Diagnostics:
 
     def status(self, node: str) -> Any:
         """Return the newest status of a node, None before the first."""
-        found = [s for m in self._messages for s in m.status if s.name == node]
-        return found[-1] if found else None
+        statuses = [s for m in self._messages for s in m.status if s.name == node]
+        return statuses[-1] if statuses else None
 
     def values(self, node: str) -> dict[str, str]:
         """Return the newest keys and values of a node."""

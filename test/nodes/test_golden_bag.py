@@ -1,4 +1,4 @@
-"""The golden bags through real nodes against oracles that share no code with the package (test/data/make_golden*.py).
+"""The golden bags through real nodes against oracles that share no code with the package (test/oracles/).
 
 One replay process plays the bag of track tables to three centres, one a rule; another one that of Odometry, on a clock
 of its own. What is published is recorded in both storage formats, and both recordings are played again.
@@ -134,8 +134,8 @@ def compare(messages: list[PointCloud2], oracle: str) -> None:
             assert getattr(got, field).tolist() == [t[field] for t in want], (at, field)
         assert got.weight.shape[1] == 1
         for k, track in enumerate(want):
-            for found, value in ((got.mean[k, 0], track["mean"]), (got.cov[k, 0], track["cov"])):
-                np.testing.assert_allclose(found, value, rtol=0, atol=TOLERANCE * np.abs(value).max(), err_msg=str(at))
+            for fused, value in ((got.mean[k, 0], track["mean"]), (got.cov[k, 0], track["cov"])):
+                np.testing.assert_allclose(fused, value, rtol=0, atol=TOLERANCE * np.abs(value).max(), err_msg=str(at))
 
 
 @pytest.mark.parametrize("name", [*RULES, "odometry"])
@@ -202,10 +202,10 @@ def test_identities_do_not_switch(fused: Any) -> None:
 
 #: Bag of detections, the scenario whose parameter file runs it, rule.
 SCENARIOS = [
-    ("turn", "li2022-nonlinear", "arithmetic_average"),
+    pytest.param("turn", "li2022-nonlinear", "arithmetic_average", marks=pytest.mark.slow),
     ("turn", "li2022-nonlinear", "covariance_intersection"),
     ("line", "li2022-linear", "arithmetic_average"),
-    ("line", "li2022-linear", "naive"),
+    pytest.param("line", "li2022-linear", "naive", marks=pytest.mark.slow),
 ]
 
 

@@ -19,8 +19,8 @@ from ros_helpers import NodeProcess, Probe, own_domain
 from sensor_msgs.msg import PointCloud2
 
 from track_fusion.demo.bringup import Nodes, local_environment, running, start_scenario
-from track_fusion.scenarios import get_scenario
 from track_fusion.scenarios.li2022 import linear as li2022_linear
+from track_fusion.study.one_target import drawn
 
 SCENARIO = "li2022-linear"
 FUSED = "/fusion_centre/tracks"
@@ -95,14 +95,17 @@ def run_once(log: Path) -> list[PointCloud2]:
 
 
 @pytest.fixture(scope="module")
-def repeats(tmp_path_factory: pytest.TempPathFactory) -> list[list[PointCloud2]]:
-    """Run 1000 steps five times, with other processes each time, and all at once: they disturb each other's timing."""
+def once(tmp_path_factory: pytest.TempPathFactory) -> list[PointCloud2]:
+    """Run 1000 steps."""
+    return run_once(tmp_path_factory.mktemp("lockstep") / "nodes.log")
+
+
+@pytest.mark.slow
+def test_five_repeats_of_1000_steps_are_bit_identical(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """With other processes each time, and all at once: they disturb each other's timing."""
     logs = [tmp_path_factory.mktemp("lockstep") / "nodes.log" for _ in range(REPEATS)]
     with ThreadPoolExecutor(REPEATS) as pool:
-        return list(pool.map(run_once, logs))
-
-
-def test_five_repeats_of_1000_steps_are_bit_identical(repeats: list[list[PointCloud2]]) -> None:
+        repeats = list(pool.map(run_once, logs))
     first = [m.data.tobytes() for m in repeats[0]]
     assert len(set(first)) == STEPS
     for other in repeats[1:]:
@@ -110,7 +113,7 @@ def test_five_repeats_of_1000_steps_are_bit_identical(repeats: list[list[PointCl
 
 
 def test_late_feedback_changes_nothing(
-    repeats: list[list[PointCloud2]], ros_context: Any, ros_domain: int, tmp_path: Path
+    once: list[PointCloud2], ros_context: Any, ros_domain: int, tmp_path: Path
 ) -> None:
     """Feedback passes through the test, which lets it go to a tracker only after the tracker has its next detection."""
     steps, log = 200, tmp_path / "nodes.log"
@@ -123,7 +126,7 @@ def test_late_feedback_changes_nothing(
             start_relayed(nodes, overrides, steps)
             collect(probe, nodes, log, messages, steps, relay.forward)
     check_stamps(messages, steps)
-    assert [m.data.tobytes() for m in messages] == [m.data.tobytes() for m in repeats[0][:steps]]
+    assert [m.data.tobytes() for m in messages] == [m.data.tobytes() for m in once[:steps]]
     # Of the last step there is no next detection, so its feedback never went.
     assert relay.late == dict.fromkeys(sensors, steps - 1)
 
@@ -170,29 +173,25 @@ def start_relayed(nodes: Nodes, overrides: Mapping[str, Mapping[str, Any]], step
 def library(rule: str | None) -> NDArray[np.float64]:
     """Run the library on the same draws: estimated states of all steps, (T, n)."""
     tracking = li2022_linear.TRACKING
-    truth = tracking.truth(SEED, RUN)
-    drawn = tracking.measurements(truth, SEED, RUN)
-    seen = [drawn[name][None] for name in tracking.sensors]
-    if rule is None:
-        estimates = li2022_linear.one_filter(seen[:1])
-    else:
-        choice = next(c for c in get_scenario(SCENARIO).rules if c.name == rule)
-        estimates = li2022_linear.fused_filters(choice, seen)
-    return np.array([fused.mean[0] for fused in estimates])
+    row = li2022_linear.kalman_rows()[f"kf-{rule or 'alone'}"]
+    return np.array([fused.mean[0] for fused in row.estimates(drawn(tracking, [RUN], SEED))])
 
 
 def compare_with_library(messages: list[PointCloud2], rule: str | None) -> None:
     expected = library(rule)
-    found = np.array([positions(m)[0] for m in messages[: len(expected)]])
+    estimated = np.array([positions(m)[0] for m in messages[: len(expected)]])
     assert expected.shape == (100, 4)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE * np.abs(expected).max())
+    np.testing.assert_allclose(estimated, expected, rtol=0, atol=TOLERANCE * np.abs(expected).max())
 
 
-def test_covariance_intersection_agrees_with_the_library(repeats: list[list[PointCloud2]]) -> None:
-    compare_with_library(repeats[0], "covariance_intersection")
+def test_covariance_intersection_agrees_with_the_library(once: list[PointCloud2]) -> None:
+    compare_with_library(once, "covariance_intersection")
 
 
-@pytest.mark.parametrize("rule", ["naive", "arithmetic_average", "covariance_union", None])
+@pytest.mark.parametrize(
+    "rule",
+    ["arithmetic_average", None, *(pytest.param(r, marks=pytest.mark.slow) for r in ("naive", "covariance_union"))],
+)
 def test_the_nodes_agree_with_the_library(rule: str | None, ros_context: Any, ros_domain: int, tmp_path: Path) -> None:
     log, judged = tmp_path / "nodes.log", tmp_path / "judged.json"
     with Probe(ros_context) as probe:
@@ -208,12 +207,12 @@ def test_the_nodes_agree_with_the_library(rule: str | None, ros_context: Any, ro
         assert result["all"][name] == pytest.approx(np.linalg.norm(error[:, at], axis=1).mean(), rel=TOLERANCE)
 
 
-def test_a_run_continues_beyond_the_scenario(repeats: list[list[PointCloud2]]) -> None:
+def test_a_run_continues_beyond_the_scenario(once: list[PointCloud2]) -> None:
     """The first steps do not depend on how many there are; later ones go on with the same target."""
     tracking = li2022_linear.TRACKING
     truth = tracking.truth(SEED, RUN, STEPS)
     np.testing.assert_array_equal(truth[: tracking.steps + 1], tracking.truth(SEED, RUN))
-    error = np.array([positions(m)[0] for m in repeats[0]]) - truth[1:]
+    error = np.array([positions(m)[0] for m in once]) - truth[1:]
     assert np.linalg.norm(error[-100:, :2], axis=1).mean() < 40.0  # the scenario's own figure is 19 m
 
 

@@ -45,7 +45,7 @@ from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.params import Params
 from track_fusion.rules import RULES
-from track_fusion.trackers.filters import TRACK_FILTERS
+from track_fusion.trackers.filters import FILTERS
 from track_fusion.trackers.one_target import SensorTracker, SensorTrackerParams
 from track_fusion.tracks import StateLayout, TrackBatch, planar_layout
 
@@ -366,7 +366,7 @@ def test_a_centre_counts_bad_odometry_and_fuses_the_rest(bench: Bench) -> None:
 
 
 def test_a_tracker_counts_bad_detections_and_tracks_on(bench: Bench) -> None:
-    kalman = TRACK_FILTERS["kalman"].make(MOTION, SENSOR, Params())
+    kalman = FILTERS["kalman"].make(MOTION, SENSOR, Params())
     tracker = SensorTracker(MOTION, SENSOR, kalman, "map", SensorTrackerParams())
     base_ns, value = bench.now_ns + SECOND_NS, np.array([[3.0, 4.0]])
     rows: Mapping[str, Any] = {
@@ -394,7 +394,7 @@ def test_a_tracker_counts_bad_detections_and_tracks_on(bench: Bench) -> None:
 
 def test_a_tracker_counts_bad_feedback_and_waits_for_the_good(bench: Bench) -> None:
     """Neither bad feedback nor that of another time, an empty table included, stands for the one awaited."""
-    kalman = TRACK_FILTERS["kalman"].make(MOTION, SENSOR, Params())
+    kalman = FILTERS["kalman"].make(MOTION, SENSOR, Params())
     tracker = SensorTracker(MOTION, SENSOR, kalman, "map", SensorTrackerParams())
     at_ns, value = bench.now_ns + SECOND_NS, np.array([[3.0, 4.0]])
     bench.tick(at_ns)

@@ -13,8 +13,9 @@ from rosbags.rosbag2 import Reader
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
-from track_fusion.nodes.managed import Fault
-from track_fusion.nodes.recorder import Recorder, read_bag
+from track_fusion.bags.read import read_bag
+from track_fusion.nodes.recorder import Recorder
+from track_fusion.params import Fault
 
 TYPE = "sensor_msgs/msg/PointCloud2"
 

@@ -21,28 +21,17 @@ from sensor_msgs.msg import PointCloud2
 
 from msg_adapters.arrays import merged
 from track_fusion.demo.bringup import Bringup, bringups, local_environment, running, start_scenario
-from track_fusion.filters import extended
 from track_fusion.rules import RULES, get_rule
 from track_fusion.scenarios import RuleChoice, get_scenario
 from track_fusion.scenarios.chen2022.dynamic import fusions
 from track_fusion.scenarios.li2022 import linear as li2022_linear
 from track_fusion.scenarios.li2022 import nonlinear as li2022_nonlinear
 from track_fusion.scenarios.sharma import radar_runs as sharma_radar_runs
-from track_fusion.study.one_target import (
-    GaussianFilter,
-    Row,
-    Sir,
-    drawn,
-    gaussian_alone,
-    gaussian_fused,
-    sir_alone,
-    sir_fused,
-)
+from track_fusion.study.one_target import Row, alone_row, drawn, fused_row, sir_filters
 
 SEED, RUN = 5, 2
 RUN_S = 300.0  # a run takes 5 s on two idle cores; tests of others may be running
 TOLERANCE = 1e-9
-KF = GaussianFilter(extended.predict, extended.update)
 
 
 class Case(NamedTuple):
@@ -67,20 +56,20 @@ def li2022() -> Iterator[Case]:
     linear, nonlinear, ckf = li2022_linear.TRACKING, li2022_nonlinear.TRACKING, li2022_nonlinear.CKF
     average, uniform = "arithmetic_average", {"covariance_intersection.criterion": "uniform"}
     sampled = RuleChoice("geometric_mean_sampling", RULES["geometric_mean_sampling"].params())
-    yield Case("li2022-linear", sampled.key, "", gaussian_fused(linear, KF, sampled))
-    yield Case("li2022-linear-sir", average, "sir-arithmetic_average",
-               sir_fused(linear, li2022_linear.SIR, choice("li2022-linear", average), union=True))  # fmt: skip
+    yield Case("li2022-linear", sampled.key, "", fused_row(linear, li2022_linear.KF, sampled))
+    joined = fused_row(linear, sir_filters(li2022_linear.SIR), choice("li2022-linear", average), join=True)
+    yield Case("li2022-linear-sir", average, "sir-arithmetic_average", joined)
     for rule in ("naive", average):
-        row = gaussian_fused(nonlinear, ckf, choice("li2022-nonlinear", rule))
+        row = fused_row(nonlinear, ckf, choice("li2022-nonlinear", rule))
         yield Case("li2022-nonlinear", rule, f"ckf-{rule}", row)
     ci = choice("li2022-nonlinear", "covariance_intersection@uniform")
-    yield Case("li2022-nonlinear", ci.key, f"ckf-{ci.name}", gaussian_fused(nonlinear, ckf, ci), uniform)
-    yield Case("li2022-nonlinear", None, "ckf-alone", gaussian_alone(nonlinear, ckf, 1))
-    sir: Sir = li2022_nonlinear.SIR
-    joined = sir_fused(nonlinear, sir, choice("li2022-nonlinear", average), union=True)
+    yield Case("li2022-nonlinear", ci.key, f"ckf-{ci.name}", fused_row(nonlinear, ckf, ci), uniform)
+    yield Case("li2022-nonlinear", None, "ckf-alone", alone_row(nonlinear, ckf, 1))
+    sir = sir_filters(li2022_nonlinear.SIR)
+    joined = fused_row(nonlinear, sir, choice("li2022-nonlinear", average), join=True)
     yield Case("li2022-nonlinear-sir", average, "sir-arithmetic_average", joined)
-    yield Case("li2022-nonlinear-sir", ci.key, f"sir-{ci.name}", sir_fused(nonlinear, sir, ci), uniform)
-    yield Case("li2022-nonlinear-sir", None, "sir-alone", sir_alone(nonlinear, sir, 1))
+    yield Case("li2022-nonlinear-sir", ci.key, f"sir-{ci.name}", fused_row(nonlinear, sir, ci), uniform)
+    yield Case("li2022-nonlinear-sir", None, "sir-alone", alone_row(nonlinear, sir, 1))
 
 
 def chen2022() -> Iterator[Case]:
@@ -92,12 +81,14 @@ def chen2022() -> Iterator[Case]:
         assert base is not None
         for rule in rules:
             one = choice(name, rule)
-            row = Row(lambda sample, base=base, one=one: fusions(base, "stf", one, sample.seed, sample.runs))  # type: ignore[misc]
+            row = Row(lambda draws, base=base, one=one: fusions(base, "stf", one, draws.seed, draws.runs))  # type: ignore[misc]
             parameters = {"covariance_intersection.criterion": "uniform"} if one.variant else {}
             yield Case(name, one.key, f"stf-{one.name}", row, parameters)
 
 
 CASES = [*li2022(), *chen2022()]
+#: One of each family of densities; the others are slow by their number.
+QUICK = {"li2022-nonlinear:arithmetic_average", "li2022-nonlinear-sir:alone", "chen2022-dynamic-1:mhdp_iterative"}
 RADARS, RADAR_STEPS = "sharma-radars", 40
 
 
@@ -110,7 +101,7 @@ def run(case: Case, context: Any, domain: int, folder: Path) -> tuple[list[Point
     """Run all steps of a scenario; return the fused tables and what the evaluator says."""
     log, judged = folder / "nodes.log", folder / "judged.json"
     bringup, fused = Bringup(case.name), "/fusion_centre/tracks" if case.rule else "/sensor_1/tracks"
-    trackers = bringup.trackers_of(case.rule)
+    trackers = bringup.trackers if case.rule else bringup.trackers[:1]
     patient = {"subscribers_deadline_s": START_S}
     overrides: dict[str, dict[str, Any]] = {name: {**patient, "feedback_timeout_s": RUN_S} for name in trackers}
     overrides["fusion_centre"] = {**patient, **case.parameters}
@@ -137,7 +128,9 @@ def run(case: Case, context: Any, domain: int, folder: Path) -> tuple[list[Point
     return messages, json.loads(judged.read_text())
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
+@pytest.mark.parametrize(
+    "case", [c if str(c) in QUICK else pytest.param(c, marks=pytest.mark.slow) for c in CASES], ids=str
+)
 def test_the_nodes_give_the_numbers_of_the_library(
     case: Case, ros_context: Any, ros_domain: int, tmp_path: Path
 ) -> None:
@@ -147,13 +140,13 @@ def test_the_nodes_give_the_numbers_of_the_library(
     assert tracking is not None
     step_ns, axes = round(tracking.dt_s * 1e9), tracking.motion.layout.axes
     assert [stamp_ns(m) for m in messages] == [k * step_ns for k in range(1, tracking.steps + 1)]
-    truth, sample = drawn(tracking, [RUN], SEED)
-    expected = np.array([fused.mean[0] for fused in case.library.estimates(sample)])
-    found = np.array([merged(read(m), axes)[0][0] for m in messages])
+    draws = drawn(tracking, [RUN], SEED)
+    expected = np.array([fused.mean[0] for fused in case.library.estimates(draws)])
+    estimated = np.array([merged(read(m), axes)[0][0] for m in messages])
     scale = np.abs(expected).max(0)
-    np.testing.assert_allclose(found / scale, expected / scale, rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(estimated / scale, expected / scale, rtol=0, atol=TOLERANCE)
     assert (judged["times"], judged["missed"], judged["false"]) == (tracking.steps, 0, 0)
-    compare_figures(case, judged["all"], found - truth[0, 1:])
+    compare_figures(case, judged["all"], estimated - draws.truth[0, 1:])
 
 
 def compare_figures(case: Case, judged: dict[str, Any], error: NDArray[np.float64]) -> None:
@@ -166,19 +159,20 @@ def compare_figures(case: Case, judged: dict[str, Any], error: NDArray[np.float6
     if not case.row:
         assert get_rule(case.rule or "").optional == ("seed",)
         return
-    samples = scenario.sample([RUN], SEED, lambda share: None, case.row)
-    own = {name.rpartition("/")[2]: e.value for name, e in scenario.figures(samples).items()
+    outcomes = scenario.simulate([RUN], SEED, lambda share: None, case.row)
+    own = {name.rpartition("/")[2]: e.value for name, e in scenario.figures(outcomes).items()
            if name.startswith(f"{case.row}/") and "_armse_" in name}  # fmt: skip
     assert own
     for quantity, value in own.items():
         assert judged[quantity] == pytest.approx(value, rel=TOLERANCE), quantity
 
 
+@pytest.mark.slow
 def test_radars_in_clutter_give_the_tracks_of_the_library(ros_context: Any, ros_domain: int, tmp_path: Path) -> None:
     """Every fusion depends on the one before: the centre fuses its own prediction, too."""
     pytest.importorskip("pymap3d")
     rule = "harmonic_mean"
-    case = Case(RADARS, rule, "", Row(lambda sample: iter(())), steps=RADAR_STEPS)
+    case = Case(RADARS, rule, "", Row(lambda draws: iter(())), steps=RADAR_STEPS)
     messages, judged = run(case, ros_context, ros_domain, tmp_path)
     own = sharma_radar_runs.centre(choice(RADARS, rule))
     fusions = sharma_radar_runs.local_tracks(SEED, RUN, lambda share: None)
@@ -189,15 +183,15 @@ def test_radars_in_clutter_give_the_tracks_of_the_library(ros_context: Any, ros_
     ]
     assert len(expected[-1][0]) > 10
     for msg, (tracks, _) in zip(messages, expected, strict=True):
-        found = read(msg)
+        table = read(msg)
         for field in ("track_id", "source", "status"):
-            np.testing.assert_array_equal(getattr(found, field), getattr(tracks, field))
+            np.testing.assert_array_equal(getattr(table, field), getattr(tracks, field))
         for field in ("mean", "cov", "existence"):
             want = getattr(tracks, field)
             np.testing.assert_allclose(
-                getattr(found, field), want, rtol=0, atol=TOLERANCE * np.abs(want).max(initial=1.0)
+                getattr(table, field), want, rtol=0, atol=TOLERANCE * np.abs(want).max(initial=1.0)
             )
-    truth = sharma_radar_runs.scene().truth(SEED, RUN)[:: sharma_radar_runs.FUSION_SCANS][1 : len(messages) + 1]
+    truth = sharma_radar_runs.scene().states(SEED, RUN)[:: sharma_radar_runs.FUSION_SCANS][1 : len(messages) + 1]
     of_step = [sharma_radar_runs.judged(tracks, states) for (tracks, _), states in zip(expected, truth, strict=True)]
     found_targets = sum(int(np.isfinite(step.nees).sum()) for step in of_step)
     assert (judged["times"], judged["all"]["samples"]) == (len(messages), found_targets)

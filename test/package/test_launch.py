@@ -10,7 +10,7 @@ import pytest
 import yaml
 from package import launch_stand_in
 
-from track_fusion.demo.bringup import Bringup, bringups
+from track_fusion.demo.wiring import Bringup, bringups
 from track_fusion.scenarios import get_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -38,12 +38,12 @@ def recorded(request: pytest.FixtureRequest) -> launch_stand_in.Recorded:
 
 def overrides(path: Path, **arguments: str) -> dict[str, dict[str, Any]]:
     """Return what the files after the scenario's own say, by node."""
-    found = {}
+    given = {}
     for node in launch_stand_in.load(path, ROOT, **arguments).nodes:
         assert node.parameter_files[0] == ROOT / "config" / f"{arguments.get('scenario', 'li2022-linear')}.yaml"
         for file in node.parameter_files[1:]:
-            found[node.name] = yaml.safe_load(file.read_text())[node.name]["ros__parameters"]
-    return found
+            given[node.name] = yaml.safe_load(file.read_text())[node.name]["ros__parameters"]
+    return given
 
 
 def test_every_launch_file_is_tested() -> None:
@@ -90,17 +90,17 @@ def test_topics_connect(recorded: launch_stand_in.Recorded) -> None:
 
 
 def test_arguments_reach_the_nodes_that_own_them_with_their_types() -> None:
-    found = overrides(SCENARIO, rule="naive", seed="7", pace="realtime", rate="2")
-    assert found == {
+    given = overrides(SCENARIO, rule="naive", seed="7", pace="realtime", rate="2")
+    assert given == {
         "fusion_centre": {"state_fusion": "naive", "seed": 7},
         "replay": {"seed": 7, "pace": "realtime", "rate": 2.0},
     }
-    assert isinstance(found["replay"]["rate"], float)  # an integer would be refused: the parameter is a double
+    assert isinstance(given["replay"]["rate"], float)  # an integer would be refused: the parameter is a double
 
 
 def test_the_seed_reaches_all_who_draw() -> None:
-    found = overrides(SCENARIO, scenario="li2022-nonlinear-sir", seed="7")
-    assert found == {name: {"seed": 7} for name in ("replay", "fusion_centre", "sensor_1", "sensor_2")}
+    given = overrides(SCENARIO, scenario="li2022-nonlinear-sir", seed="7")
+    assert given == {name: {"seed": 7} for name in ("replay", "fusion_centre", "sensor_1", "sensor_2")}
 
 
 def test_without_arguments_the_parameter_file_decides() -> None:
@@ -108,8 +108,8 @@ def test_without_arguments_the_parameter_file_decides() -> None:
 
 
 def test_the_demo_runs_in_lockstep_with_the_rule_asked_for() -> None:
-    found = overrides(DEMO, rule="arithmetic_average")
-    assert found == {"fusion_centre": {"state_fusion": "arithmetic_average"}, "replay": {"pace": "lockstep"}}
+    given = overrides(DEMO, rule="arithmetic_average")
+    assert given == {"fusion_centre": {"state_fusion": "arithmetic_average"}, "replay": {"pace": "lockstep"}}
 
 
 def test_an_unknown_scenario_is_refused_with_those_there_are() -> None:

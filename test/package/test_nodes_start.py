@@ -77,6 +77,7 @@ def test_launch_arguments_override_the_parameter_file(ros_context: Any, tmp_path
         assert [value.string_value for value in values] == ["naive"]
 
 
+@pytest.mark.slow
 def test_the_demo_launch_runs_to_its_end(ros_domain: int, tmp_path: Path) -> None:
     with ExitStack() as stack:
         running = {name: stack.enter_context(start(node)) for name, node in nodes_of(tmp_path, "demo").items()}

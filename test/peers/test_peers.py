@@ -1,18 +1,17 @@
 """Peers: exact on trees with channel filters, double counting without, conservative rules anywhere, mixtures too."""
 
 import doctest
-from functools import partial
 
 import numpy as np
 import pytest
+from oracles.kalman import predict, update
 
-import track_fusion.peers.peer
+import track_fusion.peers
 from track_fusion.densities.mixture.algebra import LogMixture, product
-from track_fusion.densities.mixture.divergence import grid, kl_on_grid
-from track_fusion.densities.mixture.mixture import Mixture, log_pdf
-from track_fusion.filters.kalman import predict, update
-from track_fusion.peers.peer import Peer, Schedule, by_rule, communicate, gaussian, on_tree, ring, star, sweep
-from track_fusion.rules import RULES
+from track_fusion.densities.mixture.mixture import Mixture, log_pdf, stacked
+from track_fusion.densities.on_grid import grid, kl_on_grid
+from track_fusion.peers import Peer, Schedule, by_rule, communicate, gaussian, on_tree, ring, star, sweep
+from track_fusion.rules import RULES, SourceTracks
 from track_fusion.rules.mixture_exact import MixtureExactParams
 from track_fusion.rules.mixture_wep import MixtureWepParams
 
@@ -67,8 +66,8 @@ def run(peers, seen, rounds, fuse):
 
 
 def test_the_docstrings_example_runs():
-    assert doctest.testmod(track_fusion.peers.peer).attempted > 5
-    assert doctest.testmod(track_fusion.peers.peer).failed == 0
+    assert doctest.testmod(track_fusion.peers).attempted > 5
+    assert doctest.testmod(track_fusion.peers).failed == 0
 
 
 def test_with_channel_filters_every_peer_of_a_tree_has_the_centralised_estimate():
@@ -168,8 +167,8 @@ def test_a_receiver_fuses_in_the_order_of_the_round():
     rule = RULES["inverse_covariance_intersection"]
     fuse = by_rule(rule)
     found = communicate(peers, [("b", "a"), ("c", "a")], fuse)["a"].moments
-    first = rule.fuse(track_fusion.peers.peer.sources(peers["a"].density, peers["b"].density), rule.params())
-    both = track_fusion.peers.peer.sources(gaussian(first.mean, first.cov), peers["c"].density)
+    first = rule.fuse(SourceTracks.of(stacked(peers["a"].density, peers["b"].density)), rule.params())
+    both = SourceTracks.of(stacked(gaussian(first.mean, first.cov), peers["c"].density))
     second = rule.fuse(both, rule.params())
     np.testing.assert_allclose(found[0], second.mean, rtol=1e-12)
     np.testing.assert_allclose(found[1], second.cov, rtol=1e-12)
@@ -195,14 +194,14 @@ def test_mixtures_on_a_star_agree_with_the_centralised_product():
         peers = communicate(peers, sent, fuse)
     points = grid(np.full(2, -12.0), np.full(2, 12.0), 120)
     for peer in peers.values():
-        apart = kl_on_grid(partial(log_pdf, whole.normalised), partial(log_pdf, peer.density), points)
+        apart = kl_on_grid(log_pdf(whole.normalised, points), log_pdf(peer.density, points))
         assert apart < 2e-3
     # A leaf that hears back from the hub takes its density: what it sent itself is all common.
     hub, leaf = (log_pdf(peers[name].density, points) for name in "ba")
     np.testing.assert_allclose(leaf, hub, rtol=1e-9)
     naive_bayes = by_rule(RULES["mixture_wep"], MixtureWepParams(method="naive_bayes"))
     naive = communicate({n: Peer(d) for n, d in local.items()}, sweep(links, "b")[0], naive_bayes)["b"]
-    assert kl_on_grid(partial(log_pdf, whole.normalised), partial(log_pdf, naive.density), points) > 0.05
+    assert kl_on_grid(log_pdf(whole.normalised, points), log_pdf(naive.density, points)) > 0.05
 
 
 def test_schedules_and_topologies():

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles.exact import Intersection, errors, mp
 from rules.examples import covariances, rotated
-from rules.oracles import Intersection, errors, mp
 from scipy.optimize import minimize, minimize_scalar
 
 from track_fusion.linalg import Array

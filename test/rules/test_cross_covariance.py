@@ -1,4 +1,4 @@
-"""Fusion with known cross-covariances, and the recursion that gives them, against the joint Gaussian."""
+"""Fusion with known cross-covariances against the joint Gaussian, and of filters whose errors it describes."""
 
 from __future__ import annotations
 
@@ -6,16 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from oracles.kalman import predict, update
 from rules.examples import covariances, joint_covariances, rotated
 
-from track_fusion.filters.cross_covariance import (
-    initial_cross,
-    kalman_gain,
-    kept_share,
-    predict_cross,
-    update_cross,
-)
-from track_fusion.filters.kalman import predict, update
 from track_fusion.linalg import Array
 from track_fusion.rules import FusedTracks, SourceTracks
 from track_fusion.rules.cross_covariance import RULE, CrossCovarianceParams
@@ -152,7 +145,7 @@ def test_malformed_cross_covariances() -> None:
         fuse(mean, cov, method="given")
 
 
-# Recursion ------------------------------------------------------------------------------------------------------------
+# Kalman filters of one target -----------------------------------------------------------------------------------------
 
 
 def _scenario() -> tuple[Array, Array, list[Array], list[Array]]:
@@ -163,59 +156,54 @@ def _scenario() -> tuple[Array, Array, list[Array], list[Array]]:
     ]  # fmt: skip
 
 
-def test_recursion_against_the_joint_covariance_of_all_errors() -> None:
-    """The errors of all filters are one linear system: its covariance, propagated whole, is the referee."""
+def _joint_errors(count: int, steps: int, start: Array) -> Array:
+    """Joint covariance, blocks (K, K, n, n), of the errors of filters: they are one linear system, propagated whole."""
+    transition, noise, matrices, spreads = _scenario()
+    joint, n = np.kron(np.ones((count, count)), start), len(start)
+    for _ in range(steps):
+        move = np.kron(np.eye(count), transition)
+        joint = move @ joint @ move.T + np.kron(np.ones((count, count)), noise)
+        lift, block = np.zeros_like(joint), np.zeros_like(joint)
+        for k, (matrix, spread) in enumerate(zip(matrices[:count], spreads, strict=False)):
+            at = slice(k * n, (k + 1) * n)
+            gain = joint[at, at] @ matrix.T @ np.linalg.inv(matrix @ joint[at, at] @ matrix.T + spread)
+            lift[at, at], block[at, at] = np.eye(n) - gain @ matrix, gain @ spread @ gain.T
+        joint = lift @ joint @ lift.T + block
+    return joint.reshape(count, n, count, n).swapaxes(1, 2)
+
+
+def test_tracks_of_one_target_with_the_covariance_of_all_their_errors() -> None:
     transition, noise, matrices, spreads = _scenario()
     start = np.diag([4.0, 2.0])
     count, n = len(matrices), 2
-    covs, cross = [start] * count, initial_cross(start, count)
-    joint = np.kron(np.ones((count, count)), start)
+    cross, covs = _joint_errors(count, 12, start), [start] * count
     for _ in range(12):
-        cross = predict_cross(cross, transition, noise)
-        joint = np.kron(np.eye(count), transition) @ joint @ np.kron(np.eye(count), transition).T
-        joint += np.kron(np.ones((count, count)), noise)
-        kept = []
-        block = np.zeros((count * n, count * n))
         for k, (matrix, spread) in enumerate(zip(matrices, spreads, strict=True)):
             _, cov = predict(np.zeros(n), covs[k], transition, noise)
-            gain = kalman_gain(cov, matrix, spread)
-            kept.append(kept_share(gain, matrix))
             covs[k] = update(np.zeros(n), cov, np.zeros(len(matrix)), matrix, spread)[1]
-            block[k * n : (k + 1) * n, k * n : (k + 1) * n] = gain @ spread @ gain.T
-        cross = update_cross(cross, np.stack(kept))
-        lift = np.zeros((count * n, count * n))
-        for k, share in enumerate(kept):
-            lift[k * n : (k + 1) * n, k * n : (k + 1) * n] = share
-        joint = lift @ joint @ lift.T + block
-        for i in range(count):
-            np.testing.assert_allclose(joint[i * n : (i + 1) * n, i * n : (i + 1) * n], covs[i], atol=1e-12)
-            cross[i, i] = covs[i]
-    np.testing.assert_allclose(cross.swapaxes(1, 2).reshape(count * n, count * n), joint, atol=1e-12)
+    for i in range(count):
+        np.testing.assert_allclose(cross[i, i], covs[i], atol=1e-12)
     fused = fuse(np.zeros((count, n)), np.stack(covs), cross, method="given")
     assert np.linalg.eigvalsh(np.stack(covs) - fused.cov).min() > 0  # better than each
     naive = np.linalg.inv(sum(np.linalg.inv(c) for c in covs))
     assert np.linalg.eigvalsh(fused.cov - naive).min() > 1e-3  # and honest: naive fusion claims less
 
 
-def test_fusion_with_the_recursion_is_consistent_in_simulation() -> None:
+def test_fusion_with_the_cross_covariances_is_consistent_in_simulation() -> None:
     """NEES of the fused track is chi-square; that of naive fusion is not."""
     transition, noise, matrices, spreads = _scenario()
     rng = np.random.default_rng(8)
     runs, start = 4000, np.diag([4.0, 2.0])
     state = rng.normal(size=(runs, 2)) * np.sqrt(np.diag(start))
     means, covs = [np.zeros((runs, 2))] * 2, [start] * 2
-    cross = initial_cross(start, 2)
     for _ in range(8):
         state = state @ transition.T + rng.multivariate_normal(np.zeros(2), noise, runs)
-        cross, kept = predict_cross(cross, transition, noise), []
         for k in range(2):
             z = state @ matrices[k].T + rng.multivariate_normal(np.zeros(len(spreads[k])), spreads[k], runs)
             mean, cov = predict(means[k], covs[k], transition, noise)
-            kept.append(kept_share(kalman_gain(cov, matrices[k], spreads[k]), matrices[k]))
             means[k], covs[k], _ = update(mean, cov, z, matrices[k], spreads[k])
-        cross = update_cross(cross, np.stack(kept))
     tracks = np.stack(means, 1), np.broadcast_to(np.stack(covs), (runs, 2, 2, 2))
-    fused = fuse(*tracks, np.broadcast_to(cross, (runs, 2, 2, 2, 2)), method="given")
+    fused = fuse(*tracks, np.broadcast_to(_joint_errors(2, 8, start), (runs, 2, 2, 2, 2)), method="given")
     error = fused.mean - state
     nees = np.einsum("bi,bij,bj->b", error, np.linalg.inv(fused.cov), error).mean() / 2
     assert nees == pytest.approx(1.0, abs=3.3 / np.sqrt(runs))

@@ -8,16 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from densities.elliptical import distances
 from rules.examples import covariances
 from scipy.optimize import brentq, minimize
 
 from track_fusion.densities.elliptical.elliptical import Family, generalized_gaussian, student_t
 from track_fusion.densities.elliptical.projection import nearest_mean
-from track_fusion.densities.elliptical.rao import (
-    informative_barycenter,
-    minimal_manhattan_distance,
-    rao_distance_scalar,
-)
+from track_fusion.densities.elliptical.rao import informative_barycenter, rao_distance_scalar
 from track_fusion.linalg import Array
 from track_fusion.rules import FusedTracks, SourceTracks, get_rule
 
@@ -325,7 +322,7 @@ def _manhattan_sum(family: Family, mean: Array, cov: Array, weights: Array) -> A
     fused = np.linalg.inv(np.einsum("...k,kij->...ij", weights, infos))
     centre = np.einsum("...ij,...k,kjl,kl->...i", fused, weights, infos, mean)
     scatter = fused[..., None, :, :] / family.kappa
-    lengths = minimal_manhattan_distance(family, mean, cov / family.kappa, centre[..., None, :], scatter)
+    lengths = distances.minimal_manhattan(family, mean, cov / family.kappa, centre[..., None, :], scatter)
     return np.asarray((lengths**2).sum(-1))
 
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from oracles.exact import Intersection, errors, mp
 from rules.examples import covariances, rotated
-from rules.oracles import Intersection, errors, mp
 from scipy.optimize import minimize, minimize_scalar
 
 from track_fusion.densities.gaussian import kl_divergence

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from densities.mixture.test_mixture import draw
-from rules.test_mixture_averages import as_tracks
+from densities.mixture.examples import draw
+from rules.mixtures import as_tracks
 
-from track_fusion.densities.mean_density import log_mean_density, sample_mean_density
-from track_fusion.densities.mixture.divergence import grid, moments_on_grid
+from track_fusion.densities.mixture.mean_density import log_mean_density, sample_mean_density
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf
+from track_fusion.densities.on_grid import grid, moments_on_grid
 from track_fusion.linalg import Array
 from track_fusion.params import from_dict
 from track_fusion.rules import FusedTracks, SourceTracks, get_rule
@@ -38,12 +38,9 @@ def run(key: str, tracks: SourceTracks, **values: Any) -> FusedTracks:
 
 def _on_grid(tracks: SourceTracks, kind: str, omega: float = 0.5) -> tuple[Array, Array]:
     part = tracks.mixture or Mixture(np.ones((2, 1)), tracks.mean[:, None], tracks.cov[:, None])
-
-    def density(x: Array) -> Array:
-        logs = log_pdf(part, x[None])
-        return log_mean_density(logs, np.array([omega, 1.0 - omega]), kind)  # type: ignore[arg-type]
-
-    return moments_on_grid(density, GRID)
+    logs = log_pdf(part, GRID[None])
+    log_mean = log_mean_density(logs, np.array([omega, 1.0 - omega]), kind)  # type: ignore[arg-type]
+    return moments_on_grid(log_mean, GRID)
 
 
 @pytest.mark.parametrize(

@@ -6,16 +6,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from densities.mixture.test_mixture import draw
+from densities.mixture.examples import draw
+from rules.mixtures import as_tracks
 
-from track_fusion.densities.mixture.mixture import Mixture, moments
+from track_fusion.densities.mixture.mixture import Mixture
 from track_fusion.rules import SourceTracks, get_rule
 
 KEYS = ("mixture_average", "mixture_geometric", "mixture_hybrid")
-
-
-def as_tracks(mixture: Mixture) -> SourceTracks:
-    return SourceTracks(*moments(mixture), mixture=mixture)
 
 
 def _figure_7() -> SourceTracks:

@@ -7,17 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from densities.mixture.test_mixture import draw
-from rules.test_mixture_averages import as_tracks
+from densities.mixture.examples import draw
+from rules.mixtures import as_tracks
 
 from track_fusion.densities.log_domain import normalised
 from track_fusion.densities.mixture.algebra import LogMixture, first_order, power, product
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments, sample
 from track_fusion.densities.mixture.sampling import Weighted, single_shot_em
+from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.linalg import Array
 from track_fusion.params import from_dict
-from track_fusion.rules import FusedTracks, SourceTracks, get_rule, mixture_common
-from track_fusion.scenarios.ahmed.mixtures import Problem, divergence, log_fused
+from track_fusion.rules import FusedTracks, SourceTracks, get_rule
+from track_fusion.rules.shared import sampling
+from track_fusion.scenarios.ahmed.mixtures import Problem, log_fused
 from track_fusion.scenarios.ahmed.random import study_problem
 
 
@@ -39,7 +41,7 @@ def _median(problems: list[Problem], **values: Any) -> float:
     far = []
     for p in problems:
         fused = run("mixture_exact", p.tracks(np.random.default_rng(1)), max_components=0, **values)
-        far.append(divergence(p.log_exact(), log_fused(fused)))
+        far.append(kl_on_grid(p.log_exact(), log_fused(fused)))
     return float(np.median(far))
 
 
@@ -239,7 +241,7 @@ def test_large_batches_are_cut_into_pieces_that_draw_the_same_numbers(
     common = Mixture(part.weight[:, :, 0], part.mean[:, :, 0], part.cov[:, :, 0] + 60 * np.eye(2))
     tracks = dataclasses.replace(as_tracks(part), extras={"common": common})
     whole = run(key, tracks, **values)
-    monkeypatch.setattr(mixture_common, "POINTS", 1)
+    monkeypatch.setattr(sampling, "POINTS", 1)
     generator = np.random.default_rng(0)
     cut = run(key, dataclasses.replace(tracks, extras={"common": common, "seed": generator}), **values)
     np.testing.assert_allclose(cut.mean, whole.mean, rtol=1e-9, atol=1e-9)

@@ -8,9 +8,10 @@ from typing import Any
 import mpmath
 import numpy as np
 import pytest
-from densities.mixture.test_mixture import by_scipy, draw
+from densities.mixture.examples import draw
+from oracles.mixtures import by_scipy
 from rules.examples import rotated
-from rules.test_mixture_averages import as_tracks
+from rules.mixtures import as_tracks
 from scipy import integrate
 
 from track_fusion.densities.mixture.mixture import Mixture

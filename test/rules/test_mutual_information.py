@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from oracles.exact import blend, errors, exact, mp, mutual_fusion
 from rules.examples import covariances, joint_covariances, rotated, scalar_nees
-from rules.oracles import blend, errors, exact, mp, mutual_fusion
 from scipy.optimize import minimize_scalar
 from scipy.stats import multivariate_normal
 

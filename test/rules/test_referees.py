@@ -9,7 +9,7 @@ import datetime
 
 import numpy as np
 import pytest
-from densities.mixture.test_mixture import draw
+from densities.mixture.examples import draw
 
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.linalg import Array, transpose

@@ -4,13 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+from filters.plain import Plain
 
-from track_fusion.filters import cubature
+from track_fusion.filters.cubature import Cubature
 from track_fusion.rules import RULES, SourceTracks
 from track_fusion.scenarios import RuleChoice
 from track_fusion.scenarios.li2022 import linear as li2022_linear
 from track_fusion.scenarios.li2022 import nonlinear as li2022_nonlinear
-from track_fusion.study.one_target import Sample, drawn
+from track_fusion.study.one_target import drawn
 
 RUNS = 100
 #: sd of one 100-run table, position, from 500 runs of our own times sqrt(5).
@@ -24,7 +25,7 @@ CKF = {
 
 def study(module, rows, runs, seed):
     part = dataclasses.replace(module.STUDY, rows={n: module.STUDY.rows[n] for n in rows})
-    return part.figures(part.sample(range(runs), seed, lambda share: None))
+    return part.figures(part.simulate(range(runs), seed, lambda share: None))
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +59,7 @@ def test_covariance_union_of_table_2_is_a_valid_bound_and_worse_than_the_average
 def test_the_union_of_least_determinant_keeps_the_turn_rate_in_bounds():
     """In this run the bound of least trace, in metres and radians at once, lets it grow to 10^4 deg/s."""
     part = dataclasses.replace(li2022_nonlinear.STUDY, rows={"u": li2022_nonlinear.STUDY.rows["sir-covariance_union"]})
-    errors = part.sample([219], 0, lambda share: None)["u/turn_rate_error_degps"]
+    errors = part.simulate([219], 0, lambda share: None)["u/turn_rate_error_degps"]
     assert np.abs(errors).max() < 15.0
 
 
@@ -82,10 +83,10 @@ def test_particle_rows_of_table_1():
 @pytest.mark.parametrize("module", [li2022_linear, li2022_nonlinear])
 def test_rows_do_not_depend_on_the_batch(module):
     short = dataclasses.replace(module.TRACKING, steps=5)
-    _, sample = drawn(short, range(3), 0)
+    draws = drawn(short, range(3), 0)
     for name, row in module.STUDY.rows.items():
-        together = [fused for _, fused in zip(range(5), row.estimates(sample), strict=False)]
-        alone = row.estimates(Sample(0, range(1, 2), [z[1:2] for z in sample.seen]))
+        together = [fused for _, fused in zip(range(5), row.estimates(draws), strict=False)]
+        alone = row.estimates(draws.part(slice(1, 2)))
         for whole, one in zip(together, alone, strict=False):
             np.testing.assert_allclose(one.mean[0], whole.mean[1], rtol=1e-9, err_msg=name)
             np.testing.assert_allclose(one.cov[-1], whole.cov[-1 if len(whole.cov) == 1 else 1], rtol=1e-7, atol=1e-9)
@@ -93,11 +94,11 @@ def test_rows_do_not_depend_on_the_batch(module):
 
 @pytest.mark.parametrize("module", [li2022_linear, li2022_nonlinear])
 def test_rows_are_chosen_by_the_beginning_of_their_names(module):
-    found = module.SCENARIO.study(2, 0, only="sir-ic@")
+    found = module.SCENARIO.measure(2, 0, only="sir-ic@")
     wanted = [quantity.armse for quantity in module.QUANTITIES]
     assert list(found) == [f"sir-ic@multinomial/{q}" for q in (*wanted, "position_claimed_m", "position_credibility_1")]
     with pytest.raises(ValueError, match="Unknown row 'sir-ci'. Did you mean 'sir-ic'"):
-        module.SCENARIO.study(2, 0, only="sir-ci")
+        module.SCENARIO.measure(2, 0, only="sir-ci")
 
 
 def test_cubature_filters_under_rules_that_the_user_names():
@@ -105,14 +106,12 @@ def test_cubature_filters_under_rules_that_the_user_names():
     tracking, rule = li2022_nonlinear.TRACKING, RULES["mhdp_explicit"]
     choice = RuleChoice("mhdp_explicit", rule.params(), "mine")
     found = li2022_nonlinear.SCENARIO.compare([choice], [3], 1, lambda share: None)
-    truth, sample = drawn(tracking, [3], 1)
+    _, _, truth, seen = drawn(tracking, [3], 1)
+    one = Plain(Cubature())
     mean, cov, squares = tracking.initial_mean, tracking.initial_cov, []
     for k in range(tracking.steps):
-        mean, cov = cubature.predict(mean, cov, tracking.motion.over(tracking.dt_s))
-        local = [
-            cubature.update(mean, cov, z[0, k], s)[:2]
-            for z, s in zip(sample.seen, tracking.sensors.values(), strict=True)
-        ]
+        mean, cov = one.predict(mean, cov, tracking.motion.over(tracking.dt_s))
+        local = [one.update(mean, cov, z[0, k], s)[:2] for z, s in zip(seen, tracking.sensors.values(), strict=True)]
         fused = rule(SourceTracks(np.stack([m for m, _ in local]), np.stack([c for _, c in local])))
         mean, cov = fused.mean, fused.cov
         squares.append((mean - truth[0, k + 1]) ** 2)

@@ -14,15 +14,8 @@ from track_fusion.rules import RULES, SourceTracks
 from track_fusion.scenarios import SCENARIOS, get_scenario, judged_figures
 from track_fusion.scenarios.ahmed import search as ahmed_search
 from track_fusion.study.judgement import verdict
-from track_fusion.study.scenario import (
-    Claim,
-    Printed,
-    RuleChoice,
-    Scenario,
-    check_needs,
-    compare_each,
-    fuse_runs,
-)
+from track_fusion.study.rule_choice import RuleChoice, check_needs, compare_each, fuse_runs
+from track_fusion.study.scenario import Claim, Printed, Scenario
 
 # ---- rules over runs that share their covariances --------------------------------------------------------------------
 
@@ -33,7 +26,7 @@ def test_a_linear_rule_fuses_shared_covariances_once(key, count):
     rng, rule = np.random.default_rng(count), RULES[key]
     a = rng.normal(size=(1, count, 4, 6))
     mean, cov = 100 * rng.normal(size=(50, count, 4)), a @ transpose(a)
-    shared = fuse_runs(rule, rule.params(), mean, cov)
+    shared = fuse_runs(RuleChoice(key, rule.params()), mean, cov)
     each = rule.fuse(SourceTracks(mean, np.repeat(cov, 50, 0)), rule.params())
     assert shared.cov.shape == (1, 4, 4)
     np.testing.assert_allclose(shared.mean, each.mean, rtol=1e-9, atol=1e-9)
@@ -48,18 +41,18 @@ def test_a_linear_rule_fuses_shared_covariances_once(key, count):
 def test_another_rule_sees_every_run(key):
     rng, rule = np.random.default_rng(7), RULES[key]
     mean, cov = rng.normal(size=(5, 2, 4)), np.stack([np.eye(4), np.diag([1.0, 2.0, 3.0, 4.0])])[None]
-    fused = fuse_runs(rule, rule.params(), mean, cov)
+    fused = fuse_runs(RuleChoice(key, rule.params()), mean, cov)
     each = rule.fuse(SourceTracks(mean, np.repeat(cov, 5, 0)), rule.params())
     np.testing.assert_array_equal(fused.mean, each.mean)
     np.testing.assert_array_equal(fused.cov, each.cov)
 
 
 def test_each_run_of_a_rule_that_samples_draws_its_own_numbers():
-    rule = RULES["geometric_mean_sampling"]
-    params, mean = rule.params(samples=50), np.tile(np.random.default_rng(1).normal(size=(1, 2, 4)), (3, 1, 1))
+    choice = RuleChoice("geometric_mean_sampling", RULES["geometric_mean_sampling"].params(samples=50))
+    mean = np.tile(np.random.default_rng(1).normal(size=(1, 2, 4)), (3, 1, 1))
     cov = np.stack([np.eye(4), 2.0 * np.eye(4)])[None]
-    whole = fuse_runs(rule, params, mean, cov, [np.random.default_rng(s) for s in (1, 2, 1)])
-    last = fuse_runs(rule, params, mean[2:], cov, [np.random.default_rng(1)])
+    whole = fuse_runs(choice, mean, cov, [np.random.default_rng(s) for s in (1, 2, 1)])
+    last = fuse_runs(choice, mean[2:], cov, [np.random.default_rng(1)])
     np.testing.assert_array_equal(whole.mean[2:], last.mean)
     np.testing.assert_array_equal(whole.cov[0], whole.cov[2])
     assert np.abs(whole.mean[0] - whole.mean[1]).max() > 1e-3
@@ -78,7 +71,10 @@ def test_a_rule_that_needs_more_than_a_scenario_has_is_refused():
 
 
 def scenario(published, runs=100):
-    return Scenario("key", "", "", "", published, runs, 1, 1, (), lambda *a: {}, lambda s: {}, lambda s: [])
+    return Scenario(
+        key="key", title="", paper="", shows="", published=published, published_runs=runs,
+        simulate=lambda *a: {}, figures=lambda s: {}, charts=lambda s: [],
+    )  # fmt: skip
 
 
 def judge(values, published, name="a/m", standard_error=0.1, runs=100):
@@ -182,4 +178,4 @@ def test_every_published_figure_is_measured(key, monkeypatch):
     monkeypatch.setattr(ahmed_search, "STEPS", 1)  # names do not depend on it
     scenario = SCENARIOS[key]
     rows = os.path.commonprefix([name.rpartition("/")[0] for name in scenario.published])
-    assert set(scenario.published) <= set(scenario.study(1, 0, only=rows))
+    assert set(scenario.published) <= set(scenario.measure(1, 0, only=rows))

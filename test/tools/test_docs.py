@@ -13,7 +13,7 @@ from cli.runner import ROOT
 from click.testing import CliRunner, Result
 
 from tools.docs import Section, docs, fusion_centre_sections, sensor_tracker_sections, yaml_value
-from track_fusion.demo.bringup import bringups
+from track_fusion.demo.wiring import bringups
 from track_fusion.params import specs
 from track_fusion.rules import RULES
 from track_fusion.scenarios import SCENARIOS
@@ -47,7 +47,8 @@ def test_check_names_what_differs_and_writes_nothing(tree: Path) -> None:
     result = run("--check", "--root", str(tree))
     assert result.exit_code == 1
     named = (
-        "doc/rules.md, doc/choosing-a-rule.md, doc/scenarios.md, config/fusion_centre.yaml, config/sensor_tracker.yaml"
+        "doc/rules.md, doc/choosing-a-rule.md, doc/scenarios.md, doc/architecture.md, "
+        "config/fusion_centre.yaml, config/sensor_tracker.yaml"
     )
     assert result.stderr == f"Out of date: {named}. Run: make docs\n"
     assert [p.name for p in tree.iterdir()] == ["package.xml"]

@@ -2,16 +2,21 @@
 
 import numpy as np
 import pytest
+from filters.plain import Plain, predict, update
 
-from track_fusion.filters import cubature, extended, particle, student_t, unscented
-from track_fusion.filters.kalman import predict, update
+from track_fusion.filters import particle
+from track_fusion.filters.cubature import Cubature
+from track_fusion.filters.extended import Extended
+from track_fusion.filters.particle import SirParams
+from track_fusion.filters.student_t import StudentT, StudentTParams
+from track_fusion.filters.unscented import Unscented
 from track_fusion.models.choices import SENSORS, LinearParams, make
 from track_fusion.models.measurement import LinearSensor, RangeBearingSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
 from track_fusion.params import ParameterError, Params
 from track_fusion.random_streams import stream
-from track_fusion.trackers.filters import TRACK_FILTERS, SirParams, StudentTParams
+from track_fusion.trackers.filters import FILTERS
 from track_fusion.trackers.one_target import LostTrackError, SensorTracker, SensorTrackerParams
 from track_fusion.tracks import COASTED, CONFIRMED, StateLayout, TrackBatch, planar_layout
 
@@ -27,7 +32,7 @@ def tracker(layout=LAYOUT, sensor_sd=1.0, **params):
         NearlyConstantVelocity(layout, MotionParams(process_noise=2.0)),
         LinearSensor.position(layout, sensor_sd),
     )
-    kalman = TRACK_FILTERS["kalman"].make(motion, sensor, Params())
+    kalman = FILTERS["kalman"].make(motion, sensor, Params())
     return SensorTracker(motion, sensor, kalman, "map", SensorTrackerParams(**params))
 
 
@@ -182,8 +187,8 @@ RADAR = RangeBearingSensor(LAYOUT, 2.0, 0.01, (10.0, -20.0))
 
 def radar_tracker(key, params=None, sensor=RADAR, motion=MOTION, **initial):
     initial = initial or {"initial_mean": tuple(STATE), "initial_cov": tuple(COV.ravel())}
-    entry = TRACK_FILTERS[key]
-    made = make(TRACK_FILTERS, key, params or entry.params(), motion, sensor)
+    entry = FILTERS[key]
+    made = make(FILTERS, key, params or entry.params(), motion, sensor)
     return SensorTracker(motion, sensor, made, "map", SensorTrackerParams(**initial))
 
 
@@ -206,21 +211,18 @@ def test_a_linear_sensor_that_does_not_fit_is_refused(params, text):
 
 @pytest.mark.parametrize("key", ["extended", "unscented", "cubature", "student_t"])
 def test_each_filter_is_the_one_of_its_name(key):
-    module = {"extended": extended, "unscented": unscented, "cubature": cubature, "student_t": student_t}[key]
-    mean, cov = module.predict(STATE, COV, MOTION.over(2.0))
+    params = StudentTParams(dof=4.0) if key == "student_t" else None
+    named = {"extended": Extended(), "unscented": Unscented(), "cubature": Cubature()}
+    one = Plain(StudentT(params) if params else named[key])
     z = RADAR.observe(STATE) + [1.5, 0.01]
-    if key == "student_t":
-        mean, cov, _, _ = student_t.update(mean, cov, 4.0, z, RADAR)
-        params = StudentTParams(dof=4.0)
-    else:
-        (mean, cov, _), params = module.update(mean, cov, z, RADAR), None
+    mean, cov, _ = one.update(*one.predict(STATE, COV, MOTION.over(2.0)), z, RADAR)
     found = radar_tracker(key, params).step(2 * SECOND, z[None], None)
     np.testing.assert_allclose(found.mean[0, 0], mean, rtol=1e-12)
     np.testing.assert_allclose(found.cov[0, 0], cov, rtol=1e-12)
     assert found.dof.tolist() == [4.0 if key == "student_t" else np.inf]
 
 
-@pytest.mark.parametrize("key", TRACK_FILTERS)
+@pytest.mark.parametrize("key", FILTERS)
 def test_filters_agree_where_all_is_linear_and_nearly_gaussian(key):
     """Many particles, many degrees of freedom: then every filter approaches Kalman's."""
     params = {"particle": SirParams(particles=40_000), "student_t": StudentTParams(dof=1e6)}.get(key)
@@ -240,8 +242,8 @@ def test_filters_agree_where_all_is_linear_and_nearly_gaussian(key):
 
 def test_a_detection_brings_its_own_noise():
     z, noise = RADAR.observe(STATE) + [4.0, 0.0], np.diag([100.0, 1.0])
-    mean, cov, _ = extended.update(*extended.predict(STATE, COV, MOTION.over(1.0)), z, RangeBearingSensor(
-        LAYOUT, 10.0, 1.0, (10.0, -20.0)))  # fmt: skip
+    one, sensor = Plain(Extended()), RangeBearingSensor(LAYOUT, 10.0, 1.0, (10.0, -20.0))
+    mean, cov, _ = one.update(*one.predict(STATE, COV, MOTION.over(1.0)), z, sensor)
     found = radar_tracker("extended").step(SECOND, z[None], noise[None])
     np.testing.assert_allclose(found.mean[0, 0], mean, rtol=1e-12)
     np.testing.assert_allclose(found.cov[0, 0], cov, rtol=1e-12)
@@ -292,17 +294,30 @@ def sir(**params):
     return SirParams(**{"particles": 50, "seed": 3, "run": 2, "role": "sir a", **params})
 
 
+def gaussian(rng, mean, cov):
+    """Fifty draws of a Gaussian."""
+    return mean + rng.normal(size=(50, 4)) @ np.linalg.cholesky(cov).T
+
+
+def moved(rng, points):
+    """Points a second later."""
+    transition = MOTION.over(1.0)
+    return transition.advance(points) + rng.normal(size=(50, 4)) @ transition.noise_factor(points).T
+
+
 def test_particles_are_drawn_in_the_order_of_the_library():
     """Initial draw; then at each step motion and, before the next, resampling."""
     own, rng = radar_tracker("particle", sir()), stream(3, 2, "sir a")
-    cloud = particle.from_gaussian(STATE, COV, rng, 50)
+    points = gaussian(rng, STATE, COV)
     for k in range(1, 4):
         z = RADAR.observe(STATE) + [k, 0.0]
-        cloud, _ = particle.update(particle.predict(cloud, MOTION.over(1.0), rng), z, RADAR)
+        points = moved(rng, points)
+        square = (RADAR.residual(z, RADAR.observe(points)) ** 2 / np.diag(RADAR.noise)).sum(1)
+        weight = np.exp(-0.5 * square) / np.exp(-0.5 * square).sum()
         found = own.step(k * SECOND, z[None], None)
-        np.testing.assert_allclose(found.mean[0], cloud.points, rtol=1e-12)
-        np.testing.assert_allclose(found.weight[0], cloud.weight, rtol=1e-9, atol=1e-300)
-        cloud = particle.resample_systematic(cloud, rng)
+        np.testing.assert_allclose(found.mean[0], points, rtol=1e-12)
+        np.testing.assert_allclose(found.weight[0], weight, rtol=1e-9, atol=1e-300)
+        points = particle.resample_systematic(particle.Particles(points, np.log(weight)), rng).points
     assert not found.cov.any()
 
 
@@ -311,16 +326,17 @@ def test_particles_are_drawn_again_from_what_is_fed_back():
     for fused in (fused_at(SECOND, [1.0, 2.0, 3.0, 4.0], cov=4 * np.eye(4)), None):
         own, rng = radar_tracker("particle", sir()), stream(3, 2, "sir a")
         own_track = own.step(SECOND, z, None)
-        particle.predict(particle.from_gaussian(STATE, COV, rng, 50), MOTION.over(1.0), rng)
+        gaussian(rng, STATE, COV)
+        moved(rng, STATE)
         if fused is None:  # particles of two sources in one track
             both = particle.union([cloud_of(own_track), cloud_of(own_track)], np.array([0.25, 0.75]))
             fused = own_track.replace(mean=both.points[None], weight=both.weight[None], cov=np.zeros((1, 100, 4, 4)))
-            cloud = particle.resample_systematic(both, rng, 50)
+            points = particle.resample_systematic(both, rng, 50).points
         else:
-            cloud = particle.from_gaussian(fused.mean[0, 0], fused.cov[0, 0], rng, 50)
+            points = gaussian(rng, fused.mean[0, 0], fused.cov[0, 0])
         assert own.feed_back(fused)
         found = own.step(2 * SECOND, np.zeros((0, 2)), None)
-        np.testing.assert_allclose(found.mean[0], particle.predict(cloud, MOTION.over(1.0), rng).points, rtol=1e-12)
+        np.testing.assert_allclose(found.mean[0], moved(rng, points), rtol=1e-12)
 
 
 def test_particles_begin_anew_with_the_tracker():
@@ -357,13 +373,13 @@ def steps(own, *scans):
             yield ", ".join(batch.faults) or "good"
 
 
-@pytest.mark.parametrize("key", [key for key in TRACK_FILTERS if key != "kalman"])
+@pytest.mark.parametrize("key", [key for key in FILTERS if key != "kalman"])
 def test_a_track_lost_to_a_wild_detection_starts_anew(key):
     """Detections as far and as sharp as the screening lets pass wreck any filter; it must not stay so."""
     layout = StateLayout(("x", "y", "vx", "vy", "turn_rate"))
     turning = CoordinatedTurn(layout, CoordinatedTurnParams())
     sensor = LinearSensor.position(layout, 1.0)
-    track_filter = make(TRACK_FILTERS, key, TRACK_FILTERS[key].params(), turning, sensor)
+    track_filter = make(FILTERS, key, FILTERS[key].params(), turning, sensor)
     own = SensorTracker(turning, sensor, track_filter, "map", SensorTrackerParams())
     wild = [(1, (5.0, 1.0), 1.0), (2, (9e11, 1.0), 1.0), (3, (5.0, 1.0), 1.0), (4, (9e11, 9e11), 1e-20)]
     tame = [(k, (5.0, 1.0), 1.0) for k in range(5, 12)]
@@ -386,7 +402,7 @@ def test_a_detection_from_which_no_track_can_start_is_told(z):
 
 def test_a_lost_track_that_detections_cannot_start_goes_back_to_its_initial_state():
     motion, sensor = MOTION, LinearSensor(("vx", "vy"), np.eye(4)[2:], np.eye(2))
-    kalman = TRACK_FILTERS["kalman"].make(motion, sensor, Params())
+    kalman = FILTERS["kalman"].make(motion, sensor, Params())
     initial = SensorTrackerParams(initial_mean=(1.0, 2.0, 3.0, 4.0), initial_cov=(1.0,) * 4)
     own = SensorTracker(motion, sensor, kalman, "map", initial)
     found = list(steps(own, (1, (3.0, 4.0), None), (2, (9e11, 0.0), 1e-20), (3, (9e11, 0.0), 1e-20)))

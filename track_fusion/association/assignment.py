@@ -85,8 +85,8 @@ def nearest_neighbour(
     row_mean: Array, row_cov: Array, col_mean: Array, col_cov: Array, gamma: float, position: tuple[int, ...]
 ) -> Indices:
     """Gate and assign in one call; arguments as for `gate`, the result as for `assign`."""
-    found = gate(row_mean, row_cov, col_mean, col_cov, gamma, position)
-    return assign(found, len(row_mean), len(col_mean), gamma)
+    candidates = gate(row_mean, row_cov, col_mean, col_cov, gamma, position)
+    return assign(candidates, len(row_mean), len(col_mean), gamma)
 
 
 def nearest_pairs(first: Array, second: Array, reach: float) -> tuple[Indices, Indices]:

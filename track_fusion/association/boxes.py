@@ -38,13 +38,13 @@ def points_in_boxes(points: Array, low: Array, high: Array, period: float = np.i
         turn = np.array([0.0, period])
         owner = np.concatenate([owner, below, above])
         low, high = (np.concatenate([side, side[below] + turn, side[above] - turn]) for side in (low, high))
-    box, point = _found(points, low, high)
+    box, point = _pairs(points, low, high)
     box = owner[box]
     order = np.lexsort((point, box))
     return box[order], point[order]
 
 
-def _found(points: Array, low: Array, high: Array) -> tuple[Indices, Indices]:
+def _pairs(points: Array, low: Array, high: Array) -> tuple[Indices, Indices]:
     (x, y), (left, bottom), (right, top) = (np.ascontiguousarray(a.T) for a in (points, low, high))
     width = max(float(np.median(right - left)), float(np.ptp(x)) / len(x)) or 1.0
     height = float(np.ptp(y)) or 1.0

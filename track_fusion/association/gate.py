@@ -56,9 +56,9 @@ def gate(
         pieces = [(row[i : i + PIECE], col[i : i + PIECE]) for i in range(0, max(len(row), 1), PIECE)]
         return _joined([_exact(row_mean, row_cov, col_mean, col_cov, *piece, gamma) for piece in pieces])
     near = _near(row_mean, row_cov, col_mean, col_cov, gamma, list(position))
-    found = _joined([_exact(row_mean, row_cov, col_mean, col_cov, *piece, gamma) for piece in near])
-    order = np.lexsort((found.col, found.row))
-    return Candidates(found.row[order], found.col[order], found.distance[order], found.logdet[order])
+    pairs = _joined([_exact(row_mean, row_cov, col_mean, col_cov, *piece, gamma) for piece in near])
+    order = np.lexsort((pairs.col, pairs.row))
+    return Candidates(pairs.row[order], pairs.col[order], pairs.distance[order], pairs.logdet[order])
 
 
 def _joined(parts: list[Candidates]) -> Candidates:

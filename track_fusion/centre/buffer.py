@@ -79,14 +79,13 @@ def add(
     str or None    `stale_scan`, `out_of_order_scan`, `duplicate_scan`, `late_scan`, `duplicate_track_id`
     """
     # The silence of sources that were never heard begins with the first scan of any.
-    queues = [dataclasses.replace(q, heard_ns=now_ns) if q.heard_ns < 0 else q for q in buffer.queues]
-    queue = dataclasses.replace(queues[source], heard_ns=now_ns)
+    queues = [q if q.heard_ns >= 0 else Queue(heard_ns=now_ns) for q in buffer.queues]
+    queue = Queue(queues[source].waiting, queues[source].newest_ns, now_ns)
     reason = _refusal(config, buffer, queue, stamp_ns, now_ns)
     if reason is None and stamp_ns == queue.newest_ns:
         queue, reason = _assembled(config.sources[source].assembles, queue, scan)
     elif reason is None:
-        waiting = (*queue.waiting, Waiting(stamp_ns, now_ns, scan.owned()))
-        queue = dataclasses.replace(queue, waiting=waiting, newest_ns=stamp_ns)
+        queue = Queue((*queue.waiting, Waiting(stamp_ns, now_ns, scan.owned())), stamp_ns, now_ns)
     queues[source] = queue
     return ScanBuffer(tuple(queues), buffer.fused_ns), reason
 
@@ -110,7 +109,7 @@ def _assembled(assembles: bool, queue: Queue, piece: TrackBatch) -> tuple[Queue,
     if set(piece.track_id.tolist()) & set(last.scan.track_id.tolist()):
         return queue, "duplicate_track_id"
     last = last._replace(scan=TrackBatch.concatenate([last.scan, piece]).owned())
-    return dataclasses.replace(queue, waiting=(*queue.waiting[:-1], last)), None
+    return Queue((*queue.waiting[:-1], last), queue.newest_ns, queue.heard_ns), None
 
 
 def advance(config: CentreConfig, buffer: ScanBuffer, now_ns: int, living: bool) -> tuple[ScanBuffer, Step | None]:
@@ -125,7 +124,7 @@ def advance(config: CentreConfig, buffer: ScanBuffer, now_ns: int, living: bool)
     after, step = _popped(config, buffer, now_ns)
     idle = now_ns - buffer.fused_ns >= config.buffer.source_timeout_s * SECOND_NS
     if step is None and living and idle and all_silent(config, buffer, now_ns):
-        return dataclasses.replace(buffer, fused_ns=now_ns), Step(now_ns, {}, Counter())
+        return ScanBuffer(buffer.queues, now_ns), Step(now_ns, {}, Counter())
     return after, step
 
 
@@ -152,7 +151,7 @@ def _popped(config: CentreConfig, buffer: ScanBuffer, now_ns: int) -> tuple[Scan
         if due:
             scans[k] = queue.waiting[due - 1].scan
             superseded["superseded_scan"] += due - 1
-        queues.append(dataclasses.replace(queue, waiting=queue.waiting[due:]) if due else queue)
+        queues.append(Queue(queue.waiting[due:], queue.newest_ns, queue.heard_ns) if due else queue)
     return ScanBuffer(tuple(queues), time_ns), Step(time_ns, scans, +superseded)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
@@ -31,15 +30,13 @@ class FusionCentre:
     Tell it of each scan by `receive` and of time by `advance`, and it decides when a step runs, as the node does; or
     decide yourself, and call `step`.
 
+    doc/fusion-centre.md has an example.
+
     Attributes
     ----------
     config : CentreConfig
     state : CentreState      a value: keep it, and set it again to go back
     buffer : ScanBuffer      likewise
-
-    Example
-    -------
-    doc/fusion-centre.md has one.
     """
 
     def __init__(self, config: CentreConfig) -> None:
@@ -58,7 +55,7 @@ class FusionCentre:
     def step(self, time_ns: int, scans: Mapping[int, TrackBatch]) -> tuple[TrackBatch, StepInfo]:
         """Fuse at one time; see :func:`track_fusion.centre.step.step`."""
         self.state, published, info = step(self.config, self.state, time_ns, scans)
-        self.buffer = dataclasses.replace(self.buffer, fused_ns=time_ns)
+        self.buffer = ScanBuffer(self.buffer.queues, time_ns)
         return published, info
 
     def receive(self, source: int, scan: TrackBatch, stamp_ns: int, now_ns: int) -> str | None:
@@ -73,7 +70,3 @@ class FusionCentre:
             if due is None:
                 return
             yield Published(due.time_ns, *self.step(due.time_ns, due.scans), due.superseded)
-
-    def silence_s(self, source: int, now_ns: int) -> float:
-        """Seconds since a source was last heard (or since the first scan of any); negative: nothing yet."""
-        return self.buffer.silence_s(source, now_ns)

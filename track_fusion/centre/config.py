@@ -24,10 +24,10 @@ HISTORY_BITS = 32
 
 
 @dataclasses.dataclass(frozen=True)
-class RuleParams(Params):
+class StateFusionParams(Params):
     """How tracks are fused."""
 
-    state_fusion: str = param("covariance_intersection", "the fusion rule", choices=tuple(RULES))
+    state_fusion: str = param("covariance_intersection", "the fusion rule", choices=RULES)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,24 +44,26 @@ def manage(
     Changes
     """
     new = len(fused.tracks) - len(before)
-    ids = np.append(before.tracks.track_id, before.next_id + np.arange(new))
-    was_confirmed = np.append(before.tracks.is_confirmed, np.zeros(new, bool))
-    history, updates, hit_ever, supported_before_ns = (
-        np.concatenate([old, np.zeros((new, *old.shape[1:]), old.dtype)])
-        for old in (before.history, before.updates, before.hit_ever, before.supported_ns)
-    )
+    ids = np.concatenate([before.tracks.track_id, before.next_id + np.arange(new)])
     hit = member & fresh
+    history = _grown(before.history, new)
     history = np.where(fresh, (history << np.uint32(1)) | hit, history)
+    was_confirmed = _grown(before.tracks.is_confirmed, new)
     coasted = np.asarray(~member.any(1))
     confirmed = was_confirmed if was_confirmed.all() else was_confirmed | _confirmed(params, history)
     after = CentralTracks(
         fused.tracks.replace(track_id=ids, status=confirmed * np.uint8(CONFIRMED) + coasted * np.uint8(COASTED)),
-        fused.has, history, updates + fresh, hit_ever | hit,
-        np.where(supported_ns >= 0, supported_ns, supported_before_ns), before.next_id + new,
+        fused.has, history, _grown(before.updates, new) + fresh, _grown(before.hit_ever, new) | hit,
+        np.where(supported_ns >= 0, supported_ns, _grown(before.supported_ns, new)), before.next_id + new,
     )  # fmt: skip
     dead = coasted & _expired(params, after) if coasted.any() else coasted
     changes = Changes(ids[len(before) :], ids[confirmed & ~was_confirmed & ~dead], ids[dead])
     return after[~dead] if dead.any() else after, changes
+
+
+def _grown(array: NDArray[Any], new: int) -> NDArray[Any]:
+    """Append a row of zeros for each of the newborn."""
+    return np.concatenate([array, np.zeros((new, *array.shape[1:]), array.dtype)]) if new else array
 
 
 def _confirmed(params: TrackManagerParams, history: NDArray[np.uint32]) -> Bools:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from track_fusion.centre.config import CentreConfig
 from track_fusion.centre.state import Bools, CentralTracks
-from track_fusion.filters.extended import predict
+from track_fusion.filters.base import Gaussian
+from track_fusion.filters.extended import Extended
 from track_fusion.linalg import RIDGE, Array, is_well_conditioned
 from track_fusion.models.base import Motion
 from track_fusion.rules import Mixture, SourceTracks
@@ -180,5 +181,6 @@ def predicted_to(batch: TrackBatch, time_ns: int, motion: Motion) -> TrackBatch:
     mean, cov = np.empty_like(batch.mean), np.empty_like(batch.cov)
     for stamp in np.unique(batch.time_ns):
         at = batch.time_ns == stamp
-        mean[at], cov[at] = predict(batch.mean[at], batch.cov[at], motion.over((time_ns - int(stamp)) / SECOND_NS))
+        transition = motion.over((time_ns - int(stamp)) / SECOND_NS)
+        mean[at], cov[at] = Extended().predict(Gaussian(batch.mean[at], batch.cov[at]), transition).moments
     return batch.replace(mean=mean, cov=cov, time_ns=np.full(len(batch), time_ns))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -67,7 +67,7 @@ class CentreState:
     Attributes
     ----------
     central : CentralTracks
-    newest : tuple of TrackBatch or None    newest scan of each source, in the centre's axes and frame
+    newest : tuple of TrackBatch or None    newest scan of each source, its own, in the centre's axes and frame
     random : StreamPosition or None         where the stream of a rule that draws stands
     time_ns : int                           of the last step, -1 before the first
     """
@@ -84,17 +84,20 @@ class CentreState:
         return cls(CentralTracks.none(config), (None,) * len(config.sources), random)
 
     def __post_init__(self) -> None:
-        for array in self._arrays():
-            array.setflags(write=False)
-
-    def _arrays(self) -> Iterator[NDArray[Any]]:
         own = self.central
-        yield from (own.has, own.history, own.updates, own.hit_ever, own.supported_ns)
-        for tracks in (own.tracks, *self.newest):
-            if tracks is not None:
-                yield from (getattr(tracks, name) for name in ROW_FIELDS)
+        _freeze(own.tracks)
+        for array in (own.has, own.history, own.updates, own.hit_ever, own.supported_ns):
+            array.setflags(write=False)
 
     def __setstate__(self, fields: Mapping[str, Any]) -> None:
         """Take what was pickled; NumPy forgets that it must not be written to."""
         vars(self).update(fields)
         self.__post_init__()
+        for scan in self.newest:
+            if scan is not None:
+                _freeze(scan)
+
+
+def _freeze(tracks: TrackBatch) -> None:
+    for name in ROW_FIELDS:
+        getattr(tracks, name).setflags(write=False)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import sys
 
 #: Which optional extra of this package brings a missing module.
-_EXTRAS = {"click": "cli", "rich": "cli", "rosbags": "bags", "matplotlib": "report", "rclpy": "ros"}
+_EXTRAS = {
+    **dict.fromkeys(("click", "jsonschema", "rich"), "cli"), "rosbags": "bags", "matplotlib": "report", "rclpy": "ros",
+}  # fmt: skip
 
 
 def main() -> None:

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 import click
 
-from track_fusion.params import nearest
+from track_fusion.params import Fault, nearest
 
 #: Commands in the order of the help; command x is the function x of track_fusion/cli/x.py.
 COMMANDS = ("demo", "fuse", "rules", "scenarios", "reproduce", "compare", "record")
@@ -68,7 +68,7 @@ class Application(click.Group):
         # LinAlgError and ParameterError are ValueErrors; a number too large for a float is an OverflowError.
         except (ValueError, OverflowError) as error:
             _end(str(error) or type(error).__name__, WRONG_INPUT)
-        except OSError as error:
+        except (OSError, Fault) as error:
             _end(str(error), 1)
         sys.exit(code if isinstance(code, int) else 0)
 

@@ -8,13 +8,15 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import click
+from rich.markup import escape
 
+from track_fusion.cli import output
 from track_fusion.params import ParameterError
 
 if TYPE_CHECKING:
     from track_fusion.metrics.significance import Difference
-    from track_fusion.scenarios import Samples, Scenario
-    from track_fusion.study.runs import RuleSpec
+    from track_fusion.scenarios import Outcomes, Scenario
+    from track_fusion.study.study import RuleSpec
 
 
 @click.command(short_help="Compare fusion rules on a published scenario.")
@@ -40,11 +42,10 @@ def compare(name: str, rules: str, params: str, runs: int | None, seed: int, job
       track-fusion compare li2022-linear --rules covariance_intersection,arithmetic_average,naive
       track-fusion compare li2022-linear --rules ./my_rule.py,covariance_intersection@uniform --runs 1000
     """  # noqa: D301  click reads \b as "do not wrap"
-    from track_fusion.cli.output import print_json
-    from track_fusion.cli.progress import studies
+    from track_fusion.cli.progress import results
     from track_fusion.metrics.significance import paired_differences
     from track_fusion.scenarios import find_scenario
-    from track_fusion.study.runs import Work, choice
+    from track_fusion.study.study import Study, choice
 
     scenario = find_scenario(name)
     if scenario.compare is None:
@@ -54,11 +55,11 @@ def compare(name: str, rules: str, params: str, runs: int | None, seed: int, job
     if len({c.name for c in chosen}) < len(chosen):
         raise ParameterError(f"The '--rules' must differ. Got {rules}.")
     count = (runs or scenario.default_runs) if scenario.random else 1
-    (study,) = studies([Work(name, find_scenario, count, seed, rules=specs)], jobs or os.cpu_count() or 1, None)
-    groups = by_filter_and_quantity(study.samples)
+    (result,) = results([Study(name, find_scenario, count, seed, rules=specs)], jobs or os.cpu_count() or 1, None)
+    groups = by_filter_and_quantity(result.outcomes)
     differences = {group: paired_differences(scores) for group, scores in groups.items()}
     if as_json:
-        print_json(_as_json(scenario, count, seed, groups, differences))
+        output.print_json(_as_json(scenario, count, seed, groups, differences))
     else:
         _print(scenario, count, seed, groups, differences)
 
@@ -71,7 +72,7 @@ def rule_specs(rules: str, params: str) -> tuple[RuleSpec, ...]:
     ParameterError    not JSON of the right form, or parameters of a rule that is not named
     """
     from track_fusion.plugins import is_path
-    from track_fusion.study.runs import RuleSpec
+    from track_fusion.study.study import RuleSpec
 
     try:
         given = json.loads(params)
@@ -91,10 +92,10 @@ def rule_specs(rules: str, params: str) -> tuple[RuleSpec, ...]:
     return tuple(map(spec, names))
 
 
-def by_filter_and_quantity(samples: Samples) -> dict[tuple[str, str], Samples]:
+def by_filter_and_quantity(outcomes: Outcomes) -> dict[tuple[str, str], Outcomes]:
     """Group scores named <filter>-<rule>/<quantity>: {(filter, quantity): {rule: (R,)}}."""
-    groups: dict[tuple[str, str], Samples] = {}
-    for name, values in samples.items():
+    groups: dict[tuple[str, str], Outcomes] = {}
+    for name, values in outcomes.items():
         row, _, quantity = name.rpartition("/")
         one, _, rule = row.partition("-")
         groups.setdefault((one, quantity), {})[rule] = values
@@ -102,7 +103,7 @@ def by_filter_and_quantity(samples: Samples) -> dict[tuple[str, str], Samples]:
 
 
 def _as_json(
-    scenario: Scenario, runs: int, seed: int, groups: Mapping[tuple[str, str], Samples],
+    scenario: Scenario, runs: int, seed: int, groups: Mapping[tuple[str, str], Outcomes],
     differences: Mapping[tuple[str, str], list[Difference]],
 ) -> dict[str, Any]:  # fmt: skip
     from track_fusion.metrics.accuracy import Estimate
@@ -123,24 +124,21 @@ def _as_json(
 
 
 def _print(
-    scenario: Scenario, runs: int, seed: int, groups: Mapping[tuple[str, str], Samples],
+    scenario: Scenario, runs: int, seed: int, groups: Mapping[tuple[str, str], Outcomes],
     differences: Mapping[tuple[str, str], list[Difference]],
 ) -> None:  # fmt: skip
-    from rich.markup import escape
-
-    from track_fusion.cli.output import console, table
     from track_fusion.metrics.accuracy import Estimate
     from track_fusion.report.page import measured_text, quantity_text
 
-    out = console()
+    out = output.console()
     out.print(f"[bold]{escape(scenario.key)}[/bold]  {runs} run{'s' * (runs > 1)}, seed {seed}, smaller is better")
     for (one, quantity), scores in groups.items():
-        means = table("rule", "mean ± standard error", title=f"{one}: {quantity_text(quantity)}")
+        means = output.table("rule", "mean ± standard error", title=f"{one}: {quantity_text(quantity)}")
         for rule in sorted(scores, key=lambda r: float(scores[r].mean())):
             mean = Estimate.mean(scores[rule])
             means.add_row(escape(rule), measured_text(mean.value, mean.standard_error))
         out.print("", means)
-        pairs = table("better", "worse", "by", "p")
+        pairs = output.table("better", "worse", "by", "p")
         for d in differences[one, quantity]:
             by = measured_text(d.mean, d.standard_error)
             style = "" if d.significant else "dim"

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import click
-from rich import box
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
+
+from track_fusion.cli import output
 
 QUANTITIES = {
     "position_armse_m": "position ARMSE / m",
@@ -51,36 +52,26 @@ def demo(name: str, rules: str | None, seed: int, runs: int | None, out: Path) -
       track-fusion demo li2022-linear --rules naive,arithmetic_average
       track-fusion demo li2022-nonlinear-sir
     """  # noqa: D301  click reads \b as "do not wrap"
-    from track_fusion.demo.demo import demo_of, run_demo
-    from track_fusion.nodes.managed import Fault
+    from track_fusion.demo.demo import run_demo
+    from track_fusion.demo.plan import demo_of
 
     chosen = tuple(r.strip() for r in rules.split(",")) if rules else ()
-    began = time.monotonic()
-    console = Console()
-    columns = (
-        TextColumn("{task.description:32}"),
-        BarColumn(),
-        TextColumn("{task.percentage:3.0f} %"),
-        TimeElapsedColumn(),
-    )
-    try:
-        planned = demo_of(name, out, seed, runs, chosen)
-        with Progress(*columns, console=console) as bar:
-            tasks: dict[str, Any] = {}
+    began, out_console = time.monotonic(), output.console()
+    columns = (TextColumn("{task.description:32}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+    planned = demo_of(name, out, seed, runs, chosen)
+    with Progress(*columns, console=out_console) as bar:
+        tasks: dict[str, Any] = {}
 
-            def progress(what: str, share: float) -> None:
-                if what not in tasks:
-                    tasks[what] = bar.add_task(what, total=1.0)
-                bar.update(tasks[what], completed=share)
+        def progress(what: str, share: float) -> None:
+            if what not in tasks:
+                tasks[what] = bar.add_task(what, total=1.0)
+            bar.update(tasks[what], completed=share)
 
-            result = run_demo(planned, progress)
-    except Fault as error:
-        raise click.ClickException(str(error)) from None
-    for table in _tables(result, planned.row, planned.rules, planned.library_runs):
-        console.print(table)
-    console.print(
-        f"Done in {time.monotonic() - began:.0f} s: {out}/tracks.png, {out}/figures.json, {out}/bag", highlight=False
-    )
+        result = run_demo(planned, progress)
+    for shown in _tables(result, planned.row, planned.rules, planned.library_runs):
+        out_console.print("", shown)
+    took_s = time.monotonic() - began
+    out_console.print(f"\nDone in {took_s:.0f} s: {out}/tracks.png, {out}/figures.json, {out}/bag")
 
 
 def _tables(result: dict[str, Any], filter_row: str, rules: tuple[str, ...], runs: int) -> list[Table]:
@@ -88,28 +79,32 @@ def _tables(result: dict[str, Any], filter_row: str, rules: tuple[str, ...], run
     figures = {f["name"]: f for f in result["figures"]}
     tables = []
     for quantity, title in QUANTITIES.items():
-        table = Table(
-            title=f"{title} (ROS and library: the same one run)", box=box.SIMPLE, pad_edge=False, padding=(0, 1, 0, 0)
-        )
-        table.add_column("", no_wrap=True)
-        for column in ("ROS", "library", f"{runs} runs", "paper"):
-            table.add_column(column, justify="right", no_wrap=True)
-        table.add_column("verdict", min_width=12)
-        for row in ("alone", *rules):
-            name = f"{filter_row}-{row}"
-            many_name = f"{name},{runs}-runs" if "@" in name else f"{name}@{runs}-runs"
-            single = [figures.get(f"{path}/{name}/{quantity}") for path in ("ros", "library")]
-            many = figures.get(f"library/{many_name}/{quantity}")
-            if single[0] is None:
-                continue
-            error = "" if many is None or many["standard_error"] is None else f" ± {many['standard_error']:.2f}"
-            table.add_row(
-                "sensor 1 alone" if row == "alone" else row,
-                *("" if f is None else f"{f['value']:.4f}" for f in single),
-                "" if many is None else f"{many['value']:.2f}{error}",
-                "" if many is None or many["published"] is None else f"{many['published']:.2f}",
-                "" if many is None else many["verdict"],
-            )
-        if table.row_count:
-            tables.append(table)
+        rows = [_row(figures, filter_row, row, quantity, runs) for row in ("alone", *rules)]
+        if any(rows):
+            of_quantity = output.table(
+                "", "ROS", "library", f"{runs} runs", "paper", "verdict",
+                title=f"{title} (ROS and library: the same one run)",
+            )  # fmt: skip
+            for column in of_quantity.columns[1:5]:
+                column.justify, column.no_wrap = "right", True
+            for row in filter(None, rows):
+                of_quantity.add_row(*row)
+            tables.append(of_quantity)
     return tables
+
+
+def _row(figures: Mapping[str, Any], filter_row: str, row: str, quantity: str, runs: int) -> tuple[str, ...]:
+    """Write the figures of a row; nothing where it has none over ROS."""
+    from track_fusion.report.page import measured_text, published_text
+
+    name = f"{filter_row}-{row}"
+    many_name = f"{name},{runs}-runs" if "@" in name else f"{name}@{runs}-runs"
+    ros, library = (figures.get(f"{path}/{name}/{quantity}") for path in ("ros", "library"))
+    many = figures.get(f"library/{many_name}/{quantity}")
+    if ros is None:
+        return ()
+    label, same = "sensor 1 alone" if row == "alone" else row, "" if library is None else f"{library['value']:.4f}"
+    if many is None:
+        return label, f"{ros['value']:.4f}", same, "", "", ""
+    measured = measured_text(many["value"], many["standard_error"])
+    return label, f"{ros['value']:.4f}", same, measured, published_text(many["published"]), many["verdict"]

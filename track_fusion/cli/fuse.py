@@ -7,6 +7,8 @@ import sys
 
 import click
 
+from track_fusion.cli.output import print_json
+
 
 @click.command(short_help="Fuse tracks given as JSON by a rule.")
 @click.option("--rule", required=True, metavar="NAME", help="Fusion rule; `track-fusion rules` lists them.")
@@ -39,7 +41,6 @@ def fuse(rule: str, params: str) -> None:
       echo '{"tracks": [{"mean": [0, 0], "cov": [[4, 0], [0, 1]]}, {"mean": [1, 0], "cov": [[1, 0], [0, 4]]}]}' |
         track-fusion fuse --rule covariance_intersection --params '{"criterion": "trace"}'
     """  # noqa: D301  click reads \b as "do not wrap"
-    from track_fusion.cli.output import print_json
     from track_fusion.cli.tracks_json import read_tracks, write_fused
     from track_fusion.params import from_dict
     from track_fusion.rules import find_rule

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from track_fusion.params import Spec, specs
+from track_fusion.params import specs
 
 #: Width of a table that goes to a file or a pipe.
 FILE_WIDTH = 120
@@ -30,18 +30,18 @@ def console(*, stderr: bool = False) -> Console:
 
 def table(*columns: str, title: str | None = None) -> Table:
     """Return a table without frame, narrow enough for a terminal of 80 columns; long words wrap."""
-    found = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    bare = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
     for column in columns:
-        found.add_column(column, overflow="fold")
-    return found
+        bare.add_column(column, overflow="fold")
+    return bare
 
 
 def grid(facts: Iterable[tuple[str, str]]) -> Table:
     """Return names beside texts, slightly indented."""
-    found = Table.grid(padding=(0, 2, 0, 0))
+    pairs = Table.grid(padding=(0, 2, 0, 0))
     for name, text in facts:
-        found.add_row(f"  {escape(name)}", escape(text))
-    return found
+        pairs.add_row(f"  {escape(name)}", escape(text))
+    return pairs
 
 
 def plain(value: Any) -> Any:
@@ -69,7 +69,7 @@ def parameters(params: Any) -> list[dict[str, Any]]:
     return [
         {
             "name": name,
-            "type": type_name(spec),
+            "type": "list of " * spec.sequence + spec.kind.__name__,
             "default": default,
             "low": spec.low,
             "low_excluded": spec.strict,
@@ -81,11 +81,6 @@ def parameters(params: Any) -> list[dict[str, Any]]:
         }
         for name, (spec, default) in specs(params).items()
     ]
-
-
-def type_name(spec: Spec) -> str:
-    """Return "float", "int", "bool", "str", or "list of" one of them."""
-    return f"list of {spec.kind.__name__}" if spec.sequence else spec.kind.__name__
 
 
 def shown_default(default: Any) -> str:

@@ -7,28 +7,29 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from track_fusion.cli.output import console
+
 if TYPE_CHECKING:
-    from track_fusion.study.runs import Study, Work
+    from track_fusion.study.study import Result, Study
 
 
-def studies(works: Sequence[Work], jobs: int, store: Path | None) -> Iterator[Study]:
-    """Run studies, showing on a terminal how far each is; yield each as it is done."""
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-
-    from track_fusion.cli.output import console
-    from track_fusion.study.runs import run_studies
+def results(studies: Sequence[Study], jobs: int, store: Path | None) -> Iterator[Result]:
+    """Run studies, showing on a terminal how far each is; yield each's result as it is done."""
+    from track_fusion.study.processes import run_studies
 
     err = console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     bar = Progress(*columns, console=err, transient=True)
-    tasks = {work: bar.add_task(f"{work.scenario}, {work.runs} runs", total=1.0) for work in works}
+    tasks = {study: bar.add_task(f"{study.scenario}, {study.runs} runs", total=1.0) for study in studies}
 
-    def progress(work: Work, share: float) -> None:
-        bar.update(tasks[work], completed=share)
+    def progress(study: Study, share: float) -> None:
+        bar.update(tasks[study], completed=share)
 
     def interrupted() -> None:
         kept = "; the same command then goes on from there" if store is not None else ""
         err.print(f"Stopping when the pieces at work are done{kept} ...")
 
     with bar if err.is_terminal else contextlib.nullcontext():
-        yield from run_studies(works, jobs, store, progress, interrupted)
+        yield from run_studies(studies, jobs, store, progress, interrupted)

@@ -21,12 +21,7 @@ def record(out: Path, topics: tuple[str, ...], storage: str, sim_time: bool) -> 
     Example:
       track-fusion record run1 /fusion_centre/tracks /replay/truth:nav_msgs/msg/Odometry
     """  # noqa: D301  click reads \b as "do not wrap"
-    from track_fusion.demo.record import record_until_told
-    from track_fusion.nodes.managed import Fault
+    from track_fusion.nodes.recorder import record_until_told
 
-    try:
-        counts = record_until_told(out, topics, storage, sim_time)
-    except Fault as error:
-        raise click.ClickException(str(error)) from None
-    for topic, count in counts.items():
+    for topic, count in record_until_told(out, topics, storage, sim_time).items():
         click.echo(f"{count:8d}  {topic}")

@@ -10,12 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from rich.markup import escape
+
+from track_fusion.cli import output
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from track_fusion.report.page import Section
     from track_fusion.scenarios import Scenario
-    from track_fusion.study.runs import Study
+    from track_fusion.study.study import Result
 
 #: Colours of the verdicts in the table.
 STYLES = {"agrees": "green", "ordering only": "yellow", "does not reproduce": "red", "not given": "dim"}
@@ -60,10 +64,9 @@ def reproduce(
       track-fusion reproduce --all --out out/all
       track-fusion reproduce ./my_scenario.py --json
     """  # noqa: D301  click reads \b as "do not wrap"
-    from track_fusion.cli.output import print_json
-    from track_fusion.cli.progress import studies
+    from track_fusion.cli.progress import results
     from track_fusion.scenarios import SCENARIOS, find_scenario
-    from track_fusion.study.runs import Work
+    from track_fusion.study.study import Study
 
     if bool(names) == every:
         raise click.UsageError("Give names of scenarios, or --all.")
@@ -78,62 +81,55 @@ def reproduce(
     import matplotlib  # noqa: F401  the page needs it: better missing now than after the work
 
     chosen = tuple(SCENARIOS) if every else tuple(dict.fromkeys(names))
-    works = [Work(name, find_scenario, wanted(find_scenario(name)), seed, only) for name in chosen]
-    found = []
-    for study in studies(works, jobs or os.cpu_count() or 1, out / "pieces"):
-        found.append((study, _result(study)))
+    studies = [Study(name, find_scenario, wanted(find_scenario(name)), seed, only) for name in chosen]
+    sections = []
+    for result in results(studies, jobs or os.cpu_count() or 1, out / "pieces"):
+        sections.append(_section(result))
         if not as_json:
-            _print_tables(find_scenario(study.work.scenario), found[-1][1], study.took_s)
-    _write(out, found)
+            _print_tables(sections[-1])
+    _write(out, sections)
     if as_json:
-        results = [result for _, result in found]
-        print_json(results[0] if len(results) == 1 else results)
+        answers = [section.result for section in sections]
+        output.print_json(answers[0] if len(answers) == 1 else answers)
     else:
         click.echo(f"Written: {out / 'report.html'}, {out / 'results.json'}")
 
 
-def _result(study: Study) -> dict[str, Any]:
-    """Judge a study; what --json prints."""
+def _section(result: Result) -> Section:
+    """Judge a study: what --json prints, and what goes with it on the page."""
+    from track_fusion.report.page import Section
     from track_fusion.scenarios import find_scenario, judged_claims, judged_figures
 
-    scenario, work = find_scenario(study.work.scenario), study.work
-    measured = scenario.figures(study.samples)
-    return {
+    study, scenario = result.study, find_scenario(result.study.scenario)
+    measured = scenario.figures(result.outcomes)
+    answer = {
         "scenario": scenario.key,
-        "runs": work.runs,
-        "seed": work.seed,
+        "runs": study.runs,
+        "seed": study.seed,
         "figures": judged_figures(scenario, measured),
         "claims": judged_claims(scenario, measured),
     }
+    return Section(answer, scenario, scenario.charts(result.outcomes), result.took_s)
 
 
-def _write(out: Path, found: list[tuple[Study, dict[str, Any]]]) -> None:
+def _write(out: Path, sections: Sequence[Section]) -> None:
     """Write results.json, which is the same whenever the figures are, and report.html."""
     import numpy as np
 
     from track_fusion.cli.app import version
-    from track_fusion.cli.output import plain
-    from track_fusion.report.page import Section, page
-    from track_fusion.scenarios import find_scenario
+    from track_fusion.report.page import page
 
-    sections = []
-    for study, result in found:
-        scenario = find_scenario(study.work.scenario)
-        sections.append(Section(result, scenario, scenario.charts(study.samples), study.took_s))
-    content = [{**plain(s.result), "charts": plain(s.charts)} for s in sections]
+    content = [{**output.plain(s.result), "charts": output.plain(s.charts)} for s in sections]
     (out / "results.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     made = f"track_fusion {version()}, NumPy {np.__version__}, {time.strftime('%Y-%m-%d %H:%M')}"
     (out / "report.html").write_text(page(sections, made), encoding="utf-8")
 
 
-def _print_tables(scenario: Scenario, result: dict[str, Any], took_s: float) -> None:
+def _print_tables(section: Section) -> None:
     """Print a table a quantity, then the claims."""
-    from rich.markup import escape
-
-    from track_fusion.cli.output import console, grid, table
     from track_fusion.report.page import assumption_text, by_quantity, evidence_text, unpublished
 
-    out = console()
+    out, (result, scenario, _, took_s) = output.console(), section
     out.print(f"[bold]{escape(scenario.key)}[/bold]  {escape(scenario.title)}")
     groups = by_quantity(result["figures"])
     folded = unpublished(groups)
@@ -143,7 +139,7 @@ def _print_tables(scenario: Scenario, result: dict[str, Any], took_s: float) -> 
     if folded:
         out.print(f"\n{sum(len(groups[q]) for q in folded)} figures with nothing published: see report.html")
     if result["claims"]:
-        claims = table("claim", "verdict", title="claims")
+        claims = output.table("claim", "verdict", title="claims")
         for c in result["claims"]:
             claims.add_row(
                 escape(f"{c['claim']} ({evidence_text(c['evidence'])})"), f"[{STYLES[c['verdict']]}]{c['verdict']}[/]"
@@ -154,20 +150,17 @@ def _print_tables(scenario: Scenario, result: dict[str, Any], took_s: float) -> 
         ("Runs", f"{result['runs']}, seed {result['seed']}, {took_s:.1f} s of one processor"),
         ("Paper", scenario.paper),
     ]
-    out.print(grid([*facts, *(("Assumed", assumption_text(a)) for a in scenario.assumptions)]))
+    out.print(output.grid([*facts, *(("Assumed", assumption_text(a)) for a in scenario.assumptions)]))
 
 
 def _table(quantity: str, figures: Sequence[Mapping[str, Any]]) -> Table:
-    from rich.markup import escape
-
-    from track_fusion.cli.output import table
     from track_fusion.report.page import measured_text, published_text, quantity_text
 
     title = f"{quantity_text(quantity)}, ± standard error"
-    found = table("filter and rule", "measured", "published", "verdict", title=title)
-    found.columns[1].justify = found.columns[2].justify = "right"
+    compared = output.table("filter and rule", "measured", "published", "verdict", title=title)
+    compared.columns[1].justify = compared.columns[2].justify = "right"
     for f in figures:
         verdict = f"[{STYLES[f['verdict']]}]{f['verdict']}[/]"
         measured = measured_text(f["value"], f["standard_error"])
-        found.add_row(escape(f["name"].rpartition("/")[0]), measured, published_text(f["published"]), verdict)
-    return found
+        compared.add_row(escape(f["name"].rpartition("/")[0]), measured, published_text(f["published"]), verdict)
+    return compared

@@ -6,35 +6,69 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from track_fusion.params import ParameterError
+
 if TYPE_CHECKING:
     from rich.table import Table
 
     from track_fusion.rules import Rule
 
 
-@click.command(short_help="List the fusion rules and their parameters.")
+@click.command(short_help="List the fusion rules, or check one against the laws.")
+@click.option("--check", "name", metavar="RULE", help="Hold a rule against the laws: a key, a .py file, module:RULE.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def rules(as_json: bool) -> None:
-    """List every fusion rule: what it promises, when, its parameters, where it is from, what it costs.
+@click.pass_context
+def rules(ctx: click.Context, name: str | None, as_json: bool) -> None:
+    """List every fusion rule, also of other packages: what it promises, its parameters, where it is from, its cost.
 
     \b
     Guarantee: conservative   the covariance is never too small, whatever the correlation of the tracks
                structural     only under the correlation structure that the rule assumes
                exact          when what it needs beyond the tracks is given
                none
+    With --check it exits with 1 when the rule breaks a law.
 
     \b
     Examples:
       track-fusion rules
       track-fusion rules --json | jq '.[] | {key, guarantee}'
+      track-fusion rules --check ./best_track.py
     """  # noqa: D301  click reads \b as "do not wrap"
     from track_fusion.cli.output import print_json
     from track_fusion.rules import RULES
 
+    if name is not None:
+        ctx.exit(_check(name, as_json))
+    described = []
+    for key in RULES:
+        try:
+            described.append(describe(RULES[key]))
+        except ParameterError as error:  # of another package; the rest are listed
+            click.echo(str(error), err=True)
     if as_json:
-        print_json([describe(rule) for rule in RULES.values()], indent=2)
+        print_json(described, indent=2)
     else:
-        _print_tables([describe(rule) for rule in RULES.values()])
+        _print_tables(described)
+
+
+def _check(name: str, as_json: bool) -> int:
+    """Hold a rule against the laws, print what became of each, and return 1 if it breaks one."""
+    from rich.markup import escape
+
+    from track_fusion.cli.output import console, print_json, table
+    from track_fusion.rules import find_rule
+    from track_fusion.rules.contract import check
+
+    rule = find_rule(name)
+    verdicts = list(check(rule))
+    if as_json:
+        print_json({"rule": rule.key, "laws": [verdict._asdict() for verdict in verdicts]}, indent=2)
+    else:
+        report = table("law", "outcome", "what it says, or why not", title=f"The laws of a fusion rule, for {rule.key}")
+        for verdict in verdicts:
+            report.add_row(*map(escape, verdict))
+        console().print(report)
+    return int(any(verdict.outcome == "failed" for verdict in verdicts))
 
 
 def describe(rule: Rule) -> dict[str, Any]:
@@ -91,9 +125,9 @@ def _parameter_table(parameters: list[dict[str, Any]]) -> Table:
 
     from track_fusion.cli.output import shown_default, table
 
-    found = table("parameter", "default", "value", "meaning")
+    shown = table("parameter", "default", "value", "meaning")
     for p in parameters:
         unit = f" [{p['unit']}]" if p["unit"] else ""
         cells = (p["name"], shown_default(p["default"]), p["wanted"] + unit, p["doc"])
-        found.add_row(*(escape(cell) for cell in cells))
-    return found
+        shown.add_row(*(escape(cell) for cell in cells))
+    return shown

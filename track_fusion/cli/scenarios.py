@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import click
+from rich.markup import escape
+
+from track_fusion.cli import output
 
 
 @click.command(short_help="List the published scenarios.")
@@ -14,8 +17,7 @@ def scenarios(as_json: bool) -> None:
 
     Example: track-fusion scenarios --json
     """
-    from track_fusion.cli.output import console, grid, print_json
-    from track_fusion.demo.bringup import demos_of
+    from track_fusion.demo.wiring import demos_of
     from track_fusion.scenarios import SCENARIOS
 
     names = ("key", "title", "paper", "shows", "default_runs", "published_runs", "assumptions")
@@ -25,13 +27,11 @@ def scenarios(as_json: bool) -> None:
         for s in SCENARIOS.values()
     ]
     if as_json:
-        print_json(listed, indent=2)
+        output.print_json(listed, indent=2)
         return
-    from rich.markup import escape
-
-    out = console()
+    out = output.console()
     for s in listed:
         out.print(f"[bold]{s['key']}[/bold]  {escape(s['title'])}")
         over_ros = ", ".join(f"track-fusion demo {name}" for name in s["demos"]) or "no"
         runs = f"{s['default_runs']} by default, {s['published_runs']} in the paper"
-        out.print(grid([("Shows", s["shows"]), ("Paper", s["paper"]), ("Runs", runs), ("Over ROS", over_ros)]))
+        out.print(output.grid([("Shows", s["shows"]), ("Paper", s["paper"]), ("Runs", runs), ("Over ROS", over_ros)]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -15,26 +14,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from track_fusion.params import unknown_name_error
+from track_fusion.demo.wiring import Bringup, Overrides, share_file
 
 #: From SIGINT to the end of a node; they take a fraction of a second.
 STOP_DEADLINE_S = 10.0
 _PR_SET_PDEATHSIG = 1
-
-
-def share_file(*parts: str) -> Path:
-    """Find an installed or source-tree file such as config/li2022-linear.yaml.
-
-    Raises
-    ------
-    FileNotFoundError    it is in neither place
-    """
-    roots = [Path(p) / "share" / "track_fusion" for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
-    roots += [Path(__file__).parents[2], Path(sys.prefix) / "share" / "track_fusion"]
-    for root in roots:
-        if (path := root.joinpath(*parts)).exists():
-            return path
-    raise FileNotFoundError(f"There is no {'/'.join(parts)} in {', '.join(map(str, roots))}.")
 
 
 def local_environment(domain: int) -> dict[str, str]:
@@ -111,109 +95,22 @@ def running(environment: Mapping[str, str], log_path: Path) -> Iterator[Nodes]:
             nodes.stop()
 
 
-_SCENARIO = re.compile(r"^replay:\n  ros__parameters:\n    scenario: (\S+)$", re.MULTILINE)
-#: Nodes of a scenario that are no trackers.
-OTHERS = ("replay", "fusion_centre", "evaluator")
-
-
-class Bringup:
-    """What a parameter file config/<name>.yaml describes: replay, trackers, fusion centre and evaluator of a scenario.
-
-    Parameters
-    ----------
-    name : str    of the file: a scenario's key, or key and filter, as li2022-nonlinear-sir
-
-    Raises
-    ------
-    ParameterError    there is none; the message lists those there are
-
-    Attributes
-    ----------
-    path : Path
-    scenario : str              key of the scenario
-    trackers : tuple of str     names of the tracker nodes, those of the scenario's sensors
-    filter : str                of the trackers
-    result_every : int          the centre fuses at every so many steps
-    sections : mapping          parameters of each node by name, as the file gives them
-    """
-
-    def __init__(self, name: str) -> None:
-        import yaml  # type: ignore[import-untyped]  # comes with rclpy
-
-        known = bringups()
-        if name not in known:
-            raise unknown_name_error(name, known, "parameter file of a scenario")
-        self.path = share_file("config", f"{name}.yaml")
-        content = yaml.safe_load(self.path.read_text())
-        self.sections = {node: section["ros__parameters"] for node, section in content.items()}
-        self.scenario = str(self.sections["replay"]["scenario"])
-        self.trackers = tuple(node for node in self.sections if node not in OTHERS)
-        self.filter = str(self.sections[self.trackers[0]].get("filter", "kalman"))
-        self.result_every = int(self.sections["replay"].get("result_every", 1))
-
-    def on_top(self, name: str, rule: str | None, random: Mapping[str, Any]) -> dict[str, Any]:
-        """Parameters of a node on top of the file: the rule (None: none), and seed and run for all who draw."""
-        from track_fusion.scenarios import get_scenario
-
-        draws = name in ("replay", "fusion_centre") or self.sections[name].get("filter") == "particle"
-        given = dict(random) if draws else {}
-        if name == "replay":
-            given["sensors"] = list(self.trackers_of(rule))
-        elif name == "fusion_centre":
-            given["state_fusion"] = rule
-        elif name == "evaluator":
-            given["steps"] = get_scenario(self.scenario).played().steps // self.result_every
-        elif rule is None:
-            given["feedback"] = "none"
-        return given
-
-    def trackers_of(self, rule: str | None) -> tuple[str, ...]:
-        """Names of the trackers that run: all, or without fusion the first."""
-        return self.trackers if rule else self.trackers[:1]
-
-
-def bringups() -> dict[str, str]:
-    """List the parameter files that describe a scenario: name -> key of the scenario. Needs no YAML reader."""
-    files = sorted((path.stem, path) for path in share_file("config").glob("*.yaml"))
-    found = {name: _SCENARIO.search(path.read_text()) for name, path in files}
-    return {name: match[1] for name, match in found.items() if match}
-
-
-def demos_of(scenario: str) -> list[str]:
-    """Names of the parameter files with which a scenario runs over ROS."""
-    return [name for name, key in bringups().items() if key == scenario]
-
-
-def start_scenario(
-    nodes: Nodes,
-    name: str,
-    rule: str | None,
-    overrides: Mapping[str, Mapping[str, Any]],
-    evaluator: bool = True,
-) -> None:
-    """Start replay, trackers, centre and evaluator of a scenario, wired as launch/scenario.launch.py does.
+def start_scenario(nodes: Nodes, name: str, rule: str | None, overrides: Overrides, evaluator: bool = True) -> None:
+    """Start replay, trackers, centre and evaluator of a scenario.
 
     Parameters
     ----------
     nodes : Nodes
-    name : str                               of the parameter file, config/<name>.yaml
-    rule : str or None                       fusion rule; None = no fusion: the first sensor's tracker alone
-    overrides : {node: {parameter: value}}   on top of the file; seed and run of the replay go to all who draw
-    evaluator : bool                         whether to start that one, too
+    name : str               of the parameter file, config/<name>.yaml
+    rule : str or None       fusion rule; None = no fusion: the first sensor's tracker alone
+    overrides : Overrides    on top of the file; seed and run of the replay go to all who draw
+    evaluator : bool         whether to start that one, too
     """
+    from track_fusion.scenarios import get_scenario
+
     bringup = Bringup(name)
-    sensors = bringup.trackers_of(rule)
-    fused = "/fusion_centre/tracks" if rule else f"/{sensors[0]}/tracks"
-    random = {key: value for key, value in overrides.get("replay", {}).items() if key in ("seed", "run")}
-
-    def start(executable: str, node: str, remaps: Mapping[str, str]) -> None:
-        params = bringup.on_top(node, rule, random) | dict(overrides.get(node, {}))
-        nodes.start(executable, node, ros_arguments(node, bringup.path, params, remaps))
-
-    for sensor in sensors:
-        start("sensor_tracker", sensor, {"~/detections": f"/replay/{sensor}/detections", "~/feedback": fused})
-    if rule:
-        start("fusion_centre", "fusion_centre", {f"~/sources/{s}/tracks": f"/{s}/tracks" for s in sensors})
-    if evaluator:
-        start("evaluator", "evaluator", {"~/truth": "/replay/truth", "~/tracks": fused})
-    start("replay", "replay", {"~/fused": fused})
+    steps = get_scenario(bringup.scenario).played().steps // bringup.result_every
+    given: Overrides = {"fusion_centre": {"state_fusion": rule}, "evaluator": {"steps": steps}}
+    params = {node: {**given.get(node, {}), **overrides.get(node, {})} for node in {**given, **overrides}}
+    for spec in bringup.nodes(params, rule is not None, evaluator):
+        nodes.start(spec.executable, spec.name, ros_arguments(spec.name, spec.parameter_file, spec.params, spec.remaps))

@@ -1,10 +1,19 @@
-"""Gaussian densities: products of powers, mixtures' moments, divergences."""
+"""Gaussian densities: products of powers, mergers of near ones, divergences."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from track_fusion.linalg import Array, inverse, logdet, mahalanobis_squared, matvec, outer, symmetrise
+from track_fusion.linalg import (
+    Array,
+    inverse,
+    keep_sole,
+    logdet,
+    mahalanobis_squared,
+    matvec,
+    merged_moments,
+    symmetrise,
+)
 
 
 def weighted_product(mean: Array, cov: Array, weights: Array) -> tuple[Array, Array]:
@@ -34,39 +43,6 @@ def weighted_product(mean: Array, cov: Array, weights: Array) -> tuple[Array, Ar
     fused_mean, fused_cov = origin + scale * matvec(fused, pull), symmetrise(fused * unit)
     keep_sole(fused_mean, fused_cov, mean, cov, weights)
     return fused_mean, fused_cov
-
-
-def keep_sole(fused_mean: Array, fused_cov: Array, mean: Array, cov: Array, weights: Array) -> None:
-    """Where one track has weight 1 and all others 0, put that track itself in place of the computed result.
-
-    Shapes (..., n), (..., n, n), (..., K, n), (..., K, n, n), (..., K).
-    """
-    sole = (weights == 1.0) & (weights.sum(-1, keepdims=True) == 1.0)
-    if sole.any():
-        *batch, _ = at = np.nonzero(sole)
-        fused_mean[tuple(batch)], fused_cov[tuple(batch)] = mean[at], cov[at]
-
-
-def merge(mean: Array, cov: Array, weights: Array) -> tuple[Array, Array]:
-    """Mean and covariance of a Gaussian mixture, Li 2022 (5), (10)-(11).
-
-    Parameters
-    ----------
-    mean : (..., K, n)
-    cov : (..., K, n, n)
-    weights : (..., K)    sum to one
-
-    Returns
-    -------
-    mean (..., n), cov (..., n, n)
-    """
-    origin = mean[..., 0, :]
-    offset = mean - origin[..., None, :]
-    shift = (weights[..., None] * offset).sum(-2)
-    spread = cov + outer(offset - shift[..., None, :])
-    merged_mean, merged_cov = origin + shift, symmetrise((weights[..., None, None] * spread).sum(-3))
-    keep_sole(merged_mean, merged_cov, mean, cov, weights)
-    return merged_mean, merged_cov
 
 
 def merge_near(weight: Array, mean: Array, cov: Array, threshold: float) -> tuple[Array, Array, Array]:
@@ -99,10 +75,8 @@ def merge_near(weight: Array, mean: Array, cov: Array, threshold: float) -> tupl
     member = weight[..., None, :] * (leader[..., None, :] == np.arange(count)[:, None])
     merged = member.sum(-1)
     share = np.where(merged[..., None] > 0, member, np.eye(count)) / np.where(merged > 0, merged, 1.0)[..., None]
-    centre = np.where(merged[..., None] > 0, share @ mean, mean)
-    spread = cov[..., None, :, :, :] + outer(mean[..., None, :, :] - centre[..., :, None, :])
-    joined = symmetrise((share[..., None, None] * spread).sum(-3))
-    return merged, centre, np.where(merged[..., None, None] > 0, joined, cov)
+    every = np.broadcast_to(mean[..., None, :, :], (*share.shape, n))
+    return merged, *merged_moments(every, np.broadcast_to(cov[..., None, :, :, :], (*share.shape, n, n)), share)
 
 
 def kl_divergence(mean: Array, cov: Array, other_mean: Array, other_cov: Array) -> Array:

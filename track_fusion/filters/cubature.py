@@ -6,11 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from track_fusion.filters import sigma_points
-from track_fusion.filters.kalman import Innovation
-from track_fusion.filters.sigma_points import SigmaPoints
-from track_fusion.linalg import Array
-from track_fusion.models.base import Sensor, Transition
+from track_fusion.filters.sigma_points import SigmaPointFilter, SigmaPoints
 
 
 @lru_cache(maxsize=64)
@@ -21,44 +17,12 @@ def points(size: int) -> SigmaPoints:
     return SigmaPoints(offsets, weight, weight)
 
 
-def predict(mean: Array, cov: Array, transition: Transition) -> tuple[Array, Array]:
-    """Predict x' = f(x) + w.
-
-    Parameters
-    ----------
-    mean : (..., n)
-    cov : (..., n, n)
-    transition : Transition
-
-    Returns
-    -------
-    mean (..., n), cov (..., n, n)
-
-    Raises
-    ------
-    LinAlgError    a covariance is not positive definite
+class Cubature(SigmaPointFilter):
+    """The cubature Kalman filter.
 
     References     I. Arasaratnam, S. Haykin, Cubature Kalman filters, 2009.
     """
-    return sigma_points.predict(mean, cov, transition, points(mean.shape[-1]))
 
-
-def update(mean: Array, cov: Array, z: Array, sensor: Sensor) -> tuple[Array, Array, Innovation]:
-    """Condition on z = h(x) + v; angles are averaged about the measurement of the mean and wrapped.
-
-    Parameters
-    ----------
-    mean : (..., n)
-    cov : (..., n, n)
-    z : (..., m)
-    sensor : Sensor
-
-    Returns
-    -------
-    mean (..., n), cov (..., n, n), Innovation
-
-    Raises
-    ------
-    LinAlgError    a covariance is not positive definite
-    """
-    return sigma_points.update(mean, cov, z, sensor, points(mean.shape[-1]))
+    def points(self, size: int) -> SigmaPoints:
+        """Return the 2 n points for n axes."""
+        return points(size)

@@ -2,8 +2,9 @@
 
 Assumptions, after Huang et al. 2019, whose parameter values are not in the papers reproduced here:
 the predicted state and the measurement noise are each N(0, C) with probability p and Student-t(0, C, dof) else, with
-C the nominal covariance (the scatter of the Student-t part); p ~ Beta(a, b) anew at each step. The posterior is
-approximated by independent factors for the state (Gaussian), the two scales, indicators and probabilities.
+C the nominal matrix (covariance of the Gaussian part, scatter of the Student-t part); p ~ Beta(a, b) anew at each
+step. The posterior is approximated by independent factors for the state (Gaussian), the two scales, indicators and
+probabilities.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import digamma
 
-from track_fusion.filters import extended
+from track_fusion.filters.base import Gaussian
+from track_fusion.filters.extended import Linearising
+from track_fusion.filters.kalman import joseph, linear_gain
+from track_fusion.filters.student_t import cov_from_scatter, scatter_from_cov
 from track_fusion.linalg import Array, matvec, outer, solve, symmetrise, transpose
 from track_fusion.models.base import Sensor
 from track_fusion.params import Params, param
-
-#: Predicting is the extended Kalman filter's.
-predict = extended.predict
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,42 +58,52 @@ class Robustness:
     iterations: int
 
 
-DEFAULTS = MixtureNoiseParams()
+@dataclasses.dataclass(frozen=True)
+class GaussianStudentTMixture(Linearising):
+    """The filter: Kalman's prediction, and an update that weighs prediction and measurement by how they agree.
 
-
-def update(
-    mean: Array, cov: Array, z: Array, sensor: Sensor, params: MixtureNoiseParams = DEFAULTS
-) -> tuple[Array, Array, Robustness]:
-    """Condition on z = h(x) + v, h linearised at the mean.
-
-    Parameters
+    Attributes
     ----------
-    mean : (..., n)
-    cov : (..., n, n)    nominal covariance of the prediction
-    z : (..., m)
-    sensor : Sensor      its noise is the nominal covariance
     params : MixtureNoiseParams
-
-    Returns
-    -------
-    mean (..., n), cov (..., n, n), Robustness
+    dof : float    of the densities whose covariances state and sensor give: their scatters are the nominal matrices;
+                   infinite: the covariances themselves are
 
     Notes         Coordinate ascent on the evidence's lower bound, O(iterations n^3); it finds a local optimum,
                   starting from Gaussian noises. Mean-field posteriors tend to be too sure.
     References    Y. Huang, Y. Zhang, Y. Zhao, J. Chambers, A novel robust Gaussian-Student's t mixture
                   distribution based Kalman filter, 2019.
     """
-    residual = sensor.residual(z, sensor.observe(mean))
-    lead, (n, m) = np.broadcast_shapes(mean.shape[:-1], z.shape[:-1]), (mean.shape[-1], z.shape[-1])
-    shapes = (n, n), (m,), (m, n), (m, m)
-    parts = (cov, residual, sensor.jacobian(mean), sensor.noise)
-    whole = _Update(*(np.broadcast_to(a, (*lead, *s)).reshape(-1, *s) for a, s in zip(parts, shapes, strict=True)))
-    share, weight, converged, iterations = _ascend(whole, params)
-    precision = share + (1.0 - share) * weight
-    offset, posterior = whole.condition(precision)
-    share, precision = share.reshape(2, *lead), precision.reshape(2, *lead)
-    learned = Robustness(share[0], share[1], precision[0], precision[1], converged.reshape(lead), iterations)
-    return mean + offset.reshape(*lead, n), posterior.reshape(*lead, n, n), learned
+
+    params: MixtureNoiseParams = MixtureNoiseParams()
+    dof: float = np.inf
+
+    def begin(self, mean: Array, cov: Array) -> Gaussian:
+        """Return the density of these moments and the filter's dof."""
+        return Gaussian(mean, cov, self.dof)
+
+    def update(self, state: Gaussian, z: Array, sensor: Sensor) -> tuple[Gaussian, Robustness]:
+        """Condition on z = h(x) + v, h linearised at the mean.
+
+        Parameters
+        ----------
+        state : Gaussian    (..., n)
+        z : (..., m)
+        sensor : Sensor
+        """
+        mean = state.mean
+        residual = sensor.residual(z, sensor.observe(mean))
+        lead, (n, m) = np.broadcast_shapes(mean.shape[:-1], z.shape[:-1]), (mean.shape[-1], z.shape[-1])
+        shapes = (n, n), (m,), (m, n), (m, m)
+        nominal = scatter_from_cov(state.cov, state.dof), scatter_from_cov(sensor.noise, state.dof)
+        parts = (nominal[0], residual, sensor.jacobian(mean), nominal[1])
+        whole = _Update(*(np.broadcast_to(a, (*lead, *s)).reshape(-1, *s) for a, s in zip(parts, shapes, strict=True)))
+        share, weight, converged, iterations = _ascend(whole, self.params)
+        precision = share + (1.0 - share) * weight
+        offset, scatter = whole.condition(precision)
+        share, precision = share.reshape(2, *lead), precision.reshape(2, *lead)
+        learned = Robustness(share[0], share[1], precision[0], precision[1], converged.reshape(lead), iterations)
+        cov = cov_from_scatter(scatter.reshape(*lead, n, n), state.dof)
+        return Gaussian(mean + offset.reshape(*lead, n), cov, state.dof), learned
 
 
 class _Update(NamedTuple):
@@ -110,10 +121,8 @@ class _Update(NamedTuple):
     def condition(self, precision: Array) -> tuple[Array, Array]:
         """Kalman update with covariances divided by their precisions (2, B): shift (B, n), covariance (B, n, n)."""
         cov, noise = self.cov / precision[0, :, None, None], self.noise / precision[1, :, None, None]
-        cross = self.slope @ cov
-        gain = transpose(solve(symmetrise(cross @ transpose(self.slope) + noise), cross))
-        keep = np.eye(cov.shape[-1]) - gain @ self.slope
-        return matvec(gain, self.residual), symmetrise(keep @ cov @ transpose(keep) + gain @ noise @ transpose(gain))
+        gain, _ = linear_gain(cov, self.slope, noise)
+        return matvec(gain, self.residual), symmetrise(joseph(cov, gain, self.slope, noise))
 
     def expected_squares(self, precision: Array) -> Array:
         """Expected squares of the prediction's and the measurement's error by their nominal matrices, (2, B)."""

@@ -9,13 +9,13 @@ import numpy as np
 
 from track_fusion.densities.mixture.mixture import Mixture, moments
 from track_fusion.densities.mixture.reduction import runnalls
-from track_fusion.filters import extended
-from track_fusion.filters.interacting_multiple_model import check_chain, mixing, reweighted
-from track_fusion.filters.iterated_corrector import GaussianUpdate
+from track_fusion.filters.base import Evidence, Gaussian
+from track_fusion.filters.extended import Extended
+from track_fusion.filters.interacting_multiple_model import GaussianModeFilter, check_chain, mixing, reweighted
 from track_fusion.linalg import Array
 from track_fusion.models.base import Sensor, Transition
 
-#: (mixture (..., C), count) -> mixture of at most `count` components: those of densities/mixture_reduction.py
+#: (mixture (..., C), count) -> mixture of at most `count` components: those of densities/mixture/reduction.py
 Reduce = Callable[[Mixture, int], Mixture]
 
 
@@ -70,65 +70,68 @@ def mix(modes: MixtureModes, chain: Array) -> MixtureModes:
     return MixtureModes(following, Mixture(weight, mean, cov))
 
 
-def predict(
-    modes: MixtureModes,
-    transitions: Sequence[Transition],
-    chain: Array,
-    count: int,
-    reduce: Reduce = runnalls,
-    jump_first: bool = False,
-) -> MixtureModes:
-    """Predict one interval by extended Kalman filters, then reduce each mode to at most `count` components.
+@dataclasses.dataclass(frozen=True, eq=False)
+class GaussianSumModes:
+    """The IMM with Gaussian sums.
 
-    Parameters
+    Attributes
     ----------
-    modes : MixtureModes           (..., M)
-    transitions : M Transitions    one a mode
-    chain : (M, M)                 chain[i, j] = probability of going from mode i to mode j
-    count : int                    components to keep in each mode
-    reduce : Reduce                Runnalls, as in Ahmed
-    jump_first : bool              false: move by the old mode, then jump (Ahmed (57), (73)); true: jump, then move
+    chain : (M, M)       chain[i, j] = probability of going from mode i to mode j
+    count : int          components to keep in each mode
+    reduce : Reduce      Runnalls, as in Ahmed
+    jump_first : bool    false: move by the old mode, then jump (Ahmed (57), (73)); true: jump, then move
+    one : Filter         of a component
 
     Notes         Exact, but for the linearisation, as long as nothing is reduced: C grows M-fold at each step.
-    References    Ahmed (70)-(73) and 5.4.2.
+    References    Ahmed (67)-(73) and 5.4.2.
     """
-    modes = mix(modes, chain) if jump_first else modes
-    part = modes.mixture
-    moved = [
-        extended.predict(part.mean[..., i, :, :], part.cov[..., i, :, :, :], transition)
-        for i, transition in enumerate(transitions)
-    ]
-    mean, cov = np.stack([m for m, _ in moved], -3), np.stack([c for _, c in moved], -4)
-    modes = MixtureModes(modes.probability, Mixture(part.weight, mean, cov))
-    return _reduced(modes if jump_first else mix(modes, chain), reduce, count)
 
+    chain: Array
+    count: int
+    reduce: Reduce = runnalls
+    jump_first: bool = False
+    one: GaussianModeFilter = Extended()
 
-def _reduced(modes: MixtureModes, reduce: Reduce, count: int) -> MixtureModes:
-    if modes.mixture.weight.shape[-1] <= count:
-        return modes
-    return MixtureModes(modes.probability, reduce(modes.mixture, count))
+    def predict(self, modes: MixtureModes, transitions: Sequence[Transition]) -> MixtureModes:
+        """Predict one interval, then reduce each mode to at most `count` components.
 
+        Parameters
+        ----------
+        modes : MixtureModes           (..., M)
+        transitions : M Transitions    one a mode
 
-def update(
-    modes: MixtureModes, z: Array, sensor: Sensor, one: GaussianUpdate = extended.update
-) -> tuple[MixtureModes, Array]:
-    """Condition every component on z = h(x) + v; components and modes are weighed by their likelihoods.
+        Raises
+        ------
+        ValueError    the chain is malformed
+        """
+        modes = mix(modes, self.chain) if self.jump_first else modes
+        part = modes.mixture
+        moved = [
+            self.one.predict(Gaussian(part.mean[..., i, :, :], part.cov[..., i, :, :, :]), transition)
+            for i, transition in enumerate(transitions)
+        ]
+        mean, cov = np.stack([g.mean for g in moved], -3), np.stack([g.cov for g in moved], -4)
+        modes = MixtureModes(modes.probability, Mixture(part.weight, mean, cov))
+        modes = modes if self.jump_first else mix(modes, self.chain)
+        if modes.mixture.count <= self.count:
+            return modes
+        return MixtureModes(modes.probability, self.reduce(modes.mixture, self.count))
 
-    Parameters
-    ----------
-    modes : MixtureModes     (..., M)
-    z : (..., m)
-    sensor : Sensor
-    one : GaussianUpdate     the filter of a component
+    def update(self, modes: MixtureModes, z: Array, sensor: Sensor) -> tuple[MixtureModes, Evidence]:
+        """Condition every component on z = h(x) + v; components and modes are weighed by their likelihoods.
 
-    Returns
-    -------
-    MixtureModes, log-likelihood of z over all modes (...)
+        Parameters
+        ----------
+        modes : MixtureModes    (..., M)
+        z : (..., m)
+        sensor : Sensor
 
-    References    Ahmed (67)-(69).
-    """
-    part = modes.mixture
-    mean, cov, innovation = one(part.mean, part.cov, z[..., None, None, :], sensor)
-    weight, mode_likelihood = reweighted(part.weight, innovation.log_likelihood)
-    probability, total = reweighted(modes.probability, mode_likelihood)
-    return MixtureModes(probability, Mixture(weight, mean, cov)), total
+        Returns
+        -------
+        MixtureModes, Evidence of z over all modes
+        """
+        part = modes.mixture
+        moved, learned = self.one.update(Gaussian(part.mean, part.cov), z[..., None, None, :], sensor)
+        weight, mode_likelihood = reweighted(part.weight, learned.log_likelihood)
+        probability, total = reweighted(modes.probability, mode_likelihood)
+        return MixtureModes(probability, Mixture(weight, moved.mean, moved.cov)), Evidence(total)

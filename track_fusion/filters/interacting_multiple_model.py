@@ -7,11 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from track_fusion.densities.gaussian import merge
 from track_fusion.densities.log_domain import log_of, log_sum_exp, normalised
-from track_fusion.filters import extended
-from track_fusion.filters.iterated_corrector import GaussianUpdate
-from track_fusion.linalg import Array
+from track_fusion.filters.base import Evidence, Filter, Gaussian, Likelihood
+from track_fusion.filters.extended import Extended
+from track_fusion.linalg import Array, merged_moments
 from track_fusion.models.base import Sensor, Transition
 
 
@@ -43,7 +42,7 @@ class Modes:
     @property
     def moments(self) -> tuple[Array, Array]:
         """Mean (..., n) and covariance (..., n, n) over all modes."""
-        return merge(self.mean, self.cov, self.probability)
+        return merged_moments(self.mean, self.cov, self.probability)
 
 
 def check_chain(chain: Array, count: int) -> None:
@@ -81,58 +80,71 @@ def mix(modes: Modes, chain: Array) -> Modes:
     following, share = mixing(modes.probability, chain)
     mean = np.broadcast_to(modes.mean[..., None, :, :], (*share.shape, modes.mean.shape[-1]))
     cov = np.broadcast_to(modes.cov[..., None, :, :, :], (*mean.shape, modes.mean.shape[-1]))
-    return Modes(following, *merge(mean, cov, share))
-
-
-def predict(modes: Modes, transitions: Sequence[Transition], chain: Array, jump_first: bool = True) -> Modes:
-    """Predict one interval.
-
-    Parameters
-    ----------
-    modes : Modes                  (..., M)
-    transitions : M Transitions    one a mode
-    chain : (M, M)                 chain[i, j] = probability of going from mode i to mode j
-    jump_first : bool              true: the mode jumps, then the target moves by the new one (Blom and Bar-Shalom);
-                                   false: it moves by the old mode, then jumps (Ahmed (57), (73))
-
-    Raises
-    ------
-    ValueError    the chain is malformed
-
-    References    H. A. P. Blom, Y. Bar-Shalom, The interacting multiple model algorithm, 1988; Ahmed (70)-(73),
-                  where (71) is the probability of m_k and (73) must be divided by P(m_(k+1)).
-    """
-    modes = mix(modes, chain) if jump_first else modes
-    moved = [
-        extended.predict(modes.mean[..., i, :], modes.cov[..., i, :, :], transition)
-        for i, transition in enumerate(transitions)
-    ]
-    modes = Modes(modes.probability, np.stack([m for m, _ in moved], -2), np.stack([c for _, c in moved], -3))
-    return modes if jump_first else mix(modes, chain)
-
-
-def update(modes: Modes, z: Array, sensor: Sensor, one: GaussianUpdate = extended.update) -> tuple[Modes, Array]:
-    """Condition every mode on z = h(x) + v, and weigh it by its likelihood.
-
-    Parameters
-    ----------
-    modes : Modes            (..., M)
-    z : (..., m)
-    sensor : Sensor
-    one : GaussianUpdate     the filter within a mode
-
-    Returns
-    -------
-    Modes, log-likelihood of z over all modes (...)
-
-    References    Ahmed (67)-(69).
-    """
-    mean, cov, innovation = one(modes.mean, modes.cov, z[..., None, :], sensor)
-    probability, total = reweighted(modes.probability, innovation.log_likelihood)
-    return Modes(probability, mean, cov), total
+    return Modes(following, *merged_moments(mean, cov, share))
 
 
 def reweighted(weight: Array, log_likelihood: Array) -> tuple[Array, Array]:
     """Multiply weights (..., M) by likelihoods: the new weights, sum one, and the log of what they summed to."""
     joint = log_of(weight) + log_likelihood
     return normalised(joint), log_sum_exp(joint)
+
+
+#: The filter within a mode.
+GaussianModeFilter = Filter[Gaussian, Transition, Array, Sensor, Likelihood]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class InteractingMultipleModel:
+    """The IMM.
+
+    Attributes
+    ----------
+    chain : (M, M)       chain[i, j] = probability of going from mode i to mode j
+    jump_first : bool    true: the mode jumps, then the target moves by the new one (Blom and Bar-Shalom);
+                         false: it moves by the old mode, then jumps (Ahmed (57), (73))
+    one : Filter         within a mode
+
+    References    H. A. P. Blom, Y. Bar-Shalom, The interacting multiple model algorithm, 1988; Ahmed (67)-(73),
+                  where (71) is the probability of m_k and (73) must be divided by P(m_(k+1)).
+    """
+
+    chain: Array
+    jump_first: bool = True
+    one: GaussianModeFilter = Extended()
+
+    def predict(self, modes: Modes, transitions: Sequence[Transition]) -> Modes:
+        """Predict one interval.
+
+        Parameters
+        ----------
+        modes : Modes                  (..., M)
+        transitions : M Transitions    one a mode
+
+        Raises
+        ------
+        ValueError    the chain is malformed
+        """
+        modes = mix(modes, self.chain) if self.jump_first else modes
+        moved = [
+            self.one.predict(Gaussian(modes.mean[..., i, :], modes.cov[..., i, :, :]), transition)
+            for i, transition in enumerate(transitions)
+        ]
+        modes = Modes(modes.probability, np.stack([g.mean for g in moved], -2), np.stack([g.cov for g in moved], -3))
+        return modes if self.jump_first else mix(modes, self.chain)
+
+    def update(self, modes: Modes, z: Array, sensor: Sensor) -> tuple[Modes, Evidence]:
+        """Condition every mode on z = h(x) + v, and weigh it by its likelihood.
+
+        Parameters
+        ----------
+        modes : Modes      (..., M)
+        z : (..., m)
+        sensor : Sensor
+
+        Returns
+        -------
+        Modes, Evidence of z over all modes
+        """
+        part, learned = self.one.update(Gaussian(modes.mean, modes.cov), z[..., None, :], sensor)
+        probability, total = reweighted(modes.probability, learned.log_likelihood)
+        return Modes(probability, part.mean, part.cov), Evidence(total)

@@ -2,41 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Sequence
+from typing import Generic, TypeVar
 
-import numpy as np
-
-from track_fusion.filters.kalman import Innovation
+from track_fusion.filters.base import Evidence, Filter, Likelihood
 from track_fusion.linalg import Array
-from track_fusion.models.base import Sensor
 
-#: update of a Gaussian filter: (mean, cov, z, sensor) -> mean, cov, innovation
-GaussianUpdate = Callable[[Array, Array, Array, Sensor], tuple[Array, Array, Innovation]]
+S = TypeVar("S")
+M = TypeVar("M")
+H = TypeVar("H")
 
 
-def update(
-    mean: Array, cov: Array, zs: Sequence[Array], sensors: Sequence[Sensor], one: GaussianUpdate
-) -> tuple[Array, Array, Array]:
-    """Condition on measurements whose errors are independent, by a filter's own update for each in turn.
-
-    Parameters
-    ----------
-    mean : (..., n)
-    cov : (..., n, n)           or its root, if that is what the filter carries
-    zs : sequence of (..., m_i)
-    sensors : sequence of Sensor
-    one : callable              update of the extended, unscented, (square-root) cubature filter
-
-    Returns
-    -------
-    mean (..., n), cov (..., n, n), log-likelihood of all measurements (...)
+@dataclasses.dataclass(frozen=True)
+class IteratedCorrector(Generic[S, M, H]):
+    """A filter that updates by several sensors, whose errors are independent, in turn.
 
     Notes         For linear sensors it is the exact posterior, whatever the order; for others the order
                   matters: the sharpest sensor first makes the later linearisations better.
     References    Li 2022 (46).
     """
-    total = np.zeros(mean.shape[:-1])
-    for z, sensor in zip(zs, sensors, strict=True):
-        mean, cov, innovation = one(mean, cov, z, sensor)
-        total = total + innovation.log_likelihood
-    return mean, cov, total
+
+    one: Filter[S, M, Array, H, Likelihood]
+
+    def predict(self, state: S, motion: M) -> S:
+        """Predict as the filter does."""
+        return self.one.predict(state, motion)
+
+    def update(self, state: S, zs: Sequence[Array], sensors: Sequence[H]) -> tuple[S, Evidence]:
+        """Condition on all measurements.
+
+        Parameters
+        ----------
+        state
+        zs : sequence of (..., m_i)
+        sensors : sequence of Sensor
+
+        Returns
+        -------
+        the state, Evidence of all measurements
+        """
+        parts = []
+        for z, sensor in zip(zs, sensors, strict=True):
+            state, learned = self.one.update(state, z, sensor)
+            parts.append(learned.log_likelihood)
+        return state, Evidence(sum(parts[1:], start=parts[0]))

@@ -2,89 +2,65 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
-
 import numpy as np
 
-from track_fusion.linalg import Array, logdet, matvec, symmetrise, transpose
+from track_fusion.filters.base import Gaussian, GaussianFilter, Innovation
+from track_fusion.linalg import Array, mahalanobis_squared, matvec, solve, symmetrise, transpose
+from track_fusion.models.base import Transition
+from track_fusion.models.measurement import LinearSensor
 
 
-@dataclasses.dataclass(frozen=True)
-class Innovation:
-    """What an update learned: residual (..., m), its covariance (..., m, m), NIS and log-likelihood (...)."""
-
-    residual: Array
-    cov: Array
-    nis: Array
-
-    @property
-    def log_likelihood(self) -> Array:
-        """Log of N(residual; 0, cov)."""
-        size = self.residual.shape[-1]
-        return np.asarray(-0.5 * (self.nis + logdet(self.cov) + size * np.log(2 * np.pi)))
+def linear_gain(cov: Array, slope: Array, noise: Array) -> tuple[Array, Array]:
+    """Gain (..., n, m) of an update by a sensor of slope H (..., m, n) and noise R, and the residual's covariance."""
+    cross = slope @ cov
+    spread = symmetrise(cross @ transpose(slope) + noise)
+    return transpose(solve(spread, cross)), spread
 
 
-def predict(mean: Array, cov: Array, transition: Array, noise: Array) -> tuple[Array, Array]:
-    """Predict x' = F x + w, w ~ N(0, Q).
+def joseph(cov: Array, gain: Array, slope: Array, noise: Array) -> Array:
+    """Covariance (..., n, n) after an update, (1 - K H) P (1 - K H)' + K R K': it stays definite."""
+    keep = np.eye(cov.shape[-1]) - gain @ slope
+    return np.asarray(keep @ cov @ transpose(keep) + gain @ noise @ transpose(gain))
 
-    Parameters
-    ----------
-    mean : (..., n)
-    cov : (..., n, n)
-    transition, noise : (..., n, n)    F and Q
 
-    Returns
-    -------
-    mean (..., n), cov (..., n, n)
+def condition(state: Gaussian, residual: Array, slope: Array, noise: Array) -> tuple[Gaussian, Innovation]:
+    """Condition on the residual z - h(x) (..., m) of a sensor of slope H (..., m, n) and noise R (..., m, m)."""
+    gain, spread = linear_gain(state.cov, slope, noise)
+    posterior = symmetrise(joseph(state.cov, gain, slope, noise))
+    innovation = Innovation(residual, spread, mahalanobis_squared(residual, spread))
+    return Gaussian(state.mean + matvec(gain, residual), posterior, state.dof), innovation
+
+
+class Kalman(GaussianFilter):
+    """The Kalman filter, of linear motions and sensors.
+
+    A covariance that a batch shares stays shared: it depends on no measurement.
     """
-    return matvec(transition, mean), symmetrise(transition @ cov @ transpose(transition) + noise)
 
+    def predict(self, state: Gaussian, transition: Transition) -> Gaussian:
+        """Predict x' = F x + w, w ~ N(0, Q).
 
-def update(mean: Array, cov: Array, z: Array, matrix: Array, noise: Array) -> tuple[Array, Array, Innovation]:
-    """Condition on z = H x + v, v ~ N(0, R), in Joseph's form, which keeps the covariance definite.
+        Parameters
+        ----------
+        state : Gaussian           (..., n)
+        transition : Transition    linear: it has a matrix F
 
-    Parameters
-    ----------
-    mean : (..., n)
-    cov : (..., n, n)
-    z : (..., m)
-    matrix : (..., m, n)    H
-    noise : (..., m, m)     R
+        Raises
+        ------
+        ValueError    the motion is not linear
+        """
+        if (matrix := transition.matrix) is None:
+            raise ValueError("The 'transition' of a Kalman filter must be linear. Got one without a matrix.")
+        cov = symmetrise(matrix @ state.cov @ transpose(matrix) + transition.noise(state.mean))
+        return Gaussian(matvec(matrix, state.mean), cov, state.dof)
 
-    Returns
-    -------
-    mean (..., n), cov (..., n, n), Innovation
-    """
-    residual = z - matvec(matrix, mean)
-    cross = matrix @ cov
-    spread = symmetrise(cross @ transpose(matrix) + noise)
-    gain = transpose(np.asarray(np.linalg.solve(spread, cross), np.float64))
-    keep = np.eye(mean.shape[-1]) - gain @ matrix
-    posterior = symmetrise(keep @ cov @ transpose(keep) + gain @ noise @ transpose(gain))
-    nis = (residual * np.linalg.solve(spread, residual[..., None])[..., 0]).sum(-1)
-    return mean + matvec(gain, residual), posterior, Innovation(residual, spread, np.asarray(nis))
+    def update(self, state: Gaussian, z: Array, sensor: LinearSensor) -> tuple[Gaussian, Innovation]:
+        """Condition on z = H x + v, v ~ N(0, R), in Joseph's form, which keeps the covariance definite.
 
-
-def update_joint(
-    mean: Array, cov: Array, zs: Sequence[Array], matrices: Sequence[Array], noises: Sequence[Array]
-) -> tuple[Array, Array, Innovation]:
-    """Condition on several sensors at once: the joint likelihood of Li 2022 (46), iterated corrector (IC).
-
-    Parameters
-    ----------
-    mean, cov : as for :func:`update`
-    zs : sequence of (..., m_i)
-    matrices : sequence of (m_i, n)
-    noises : sequence of (m_i, m_i)
-
-    Returns
-    -------
-    mean (..., n), cov (..., n, n), Innovation of the stacked measurement
-    """
-    noise = np.zeros((sum(len(r) for r in noises),) * 2)
-    at = 0
-    for r in noises:
-        noise[at : at + len(r), at : at + len(r)] = r
-        at += len(r)
-    return update(mean, cov, np.concatenate(zs, -1), np.concatenate(matrices), noise)
+        Parameters
+        ----------
+        state : Gaussian         (..., n)
+        z : (..., m)
+        sensor : LinearSensor    H (m, n), or one for each state (..., m, n), and R
+        """
+        return condition(state, z - matvec(sensor.matrix, state.mean), sensor.matrix, sensor.noise)

@@ -12,83 +12,92 @@ from scipy.special import ndtri
 
 from track_fusion.densities.log_domain import log_of
 from track_fusion.densities.mixture.mixture import Mixture
+from track_fusion.filters.base import Evidence, Gaussian
+from track_fusion.filters.extended import Extended
 from track_fusion.linalg import Array, cholesky, inverse, matvec, outer, solve, symmetrise, transpose
+from track_fusion.models.base import Transition
 from track_fusion.models.detection import SoftmaxDetector
 
 LOG_2PI = float(np.log(2.0 * np.pi))
 #: Newton's iteration for the mode of a component: at most so many steps, each halved at most so often.
 NEWTON_STEPS, HALVINGS = 50, 30
-#: The mode counts as found when the next step is shorter than this, in standard deviations.
+#: The mode is reached when the next step is shorter than this, in standard deviations.
 MODE_TOLERANCE = 1e-6
 #: Laplace's covariance is inflated so much: a softly cut Gaussian has a longer tail than its mode suggests.
 INFLATION = 2.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Evidence:
-    """What an update learned.
+class SampledEvidence(Evidence):
+    """What an update learned: of what the detector said; effective share (..., M C) of each component's samples."""
 
-    Attributes
-    ----------
-    log_likelihood : (...)              of what the detector said
-    effective_share : (..., M C)        effective share of the samples behind each component
-    """
-
-    log_likelihood: Array
     effective_share: Array
 
 
-def update(
-    mixture: Mixture,
-    detector: SoftmaxDetector,
-    chance: Array,
-    samples: int = 512,
-    seed: int = 0,
-    negligible: float = 0.0,
-) -> tuple[Mixture, Evidence]:
-    """Condition a mixture on an event that has probability chance_c when the target is in the detector's class c.
+@dataclasses.dataclass(frozen=True)
+class NegativeInformation:
+    """A filter of mixtures that are cut by what a detector says.
 
-    For a camera with class 0 inside its view and detection probability p: a detection has chances (p, 0, 0, ...), no
-    detection (1 - p, 1, 1, ...).
-
-    Parameters
+    Attributes
     ----------
-    mixture : Mixture            (..., M) components
-    detector : SoftmaxDetector   C classes
-    chance : (C,)                between 0 and 1, at least one positive
-    samples : int                points for the moments of each new component
-    seed : int                   of the points' common shift
-    negligible : float           a component over which the event's probability varies (standard deviation over mean) by
-                                 no more than this keeps its shape and is weighed only: far cameras split nothing
-
-    Returns
-    -------
-    Mixture    (..., M C') components, C' classes of positive chance, weights of sum one; of a component that keeps
-               its shape all but the first have weight 0; Evidence
-
-    Raises
-    ------
-    ValueError    chances do not fit the classes or lie outside [0, 1], or all are zero
+    samples : int          points for the moments of each new component
+    negligible : float     a component over which the event's probability varies (standard deviation over mean) by no
+                           more than this keeps its shape and is weighed only: far cameras split nothing
+    seed : int             of the points' common shift
 
     Notes         Each component times each class is log-concave; it becomes the Gaussian of its own moments, found by
                   importance sampling with quasi-random points, half of them from the component, half about the
-                  product's mode. The mixture grows C'-fold: reduce it afterwards. O(M C' samples n^2).
+                  product's mode.
     References    Ahmed 5.3; N. Ahmed, E. Sample, M. Campbell, Bayesian multicategorical soft data fusion, 2013,
                   whose variational bound the mode replaces here.
     """
-    chance = _checked(chance, len(detector.bias))
-    used = np.flatnonzero(chance > 0)
-    points = _normal_points(mixture.mean.shape[-1], samples, seed)
-    log_mass, mean, cov, share = _split(mixture, detector, chance, used, points, negligible)
-    log_weight = log_of(mixture.weight)[..., None] + log_mass
-    (*lead, count, classes), n = log_weight.shape, mean.shape[-1]
-    flat = log_weight.reshape(*lead, count * classes)
-    top = flat.max(-1, keepdims=True)
-    weight = np.exp(flat - top)
-    total = weight.sum(-1, keepdims=True)
-    found = Mixture(weight / total, mean.reshape(*lead, count * classes, n), cov.reshape(*lead, count * classes, n, n))
-    log_likelihood = (np.log(total) + top)[..., 0] - np.log(mixture.weight.sum(-1))
-    return found, Evidence(np.asarray(log_likelihood), share.reshape(*lead, count * classes))
+
+    samples: int = 512
+    negligible: float = 0.0
+    seed: int = 0
+
+    def predict(self, mixture: Mixture, transition: Transition) -> Mixture:
+        """Predict x' = f(x) + w component by component, f linearised at its mean."""
+        moved = Extended().predict(Gaussian(mixture.mean, mixture.cov), transition)
+        return Mixture(mixture.weight, moved.mean, moved.cov)
+
+    def update(self, mixture: Mixture, chance: Array, detector: SoftmaxDetector) -> tuple[Mixture, SampledEvidence]:
+        """Condition on an event that has probability chance_c when the target is in the detector's class c.
+
+        For a camera with class 0 inside its view and detection probability p: a detection has chances (p, 0, 0, ...),
+        no detection (1 - p, 1, 1, ...).
+
+        Parameters
+        ----------
+        mixture : Mixture            (..., M) components
+        chance : (C,)                between 0 and 1, at least one positive
+        detector : SoftmaxDetector   C classes
+
+        Returns
+        -------
+        Mixture    (..., M C') components, C' classes of positive chance, weights of sum one; of a component that keeps
+                   its shape all but the first have weight 0; SampledEvidence
+
+        Raises
+        ------
+        ValueError    chances do not fit the classes or lie outside [0, 1], or all are zero
+
+        Notes         The mixture grows C'-fold: reduce it afterwards. O(M C' samples n^2).
+        """
+        chance = _checked(chance, len(detector.bias))
+        used = np.flatnonzero(chance > 0)
+        points = _normal_points(mixture.mean.shape[-1], self.samples, self.seed)
+        log_mass, mean, cov, share = _split(mixture, detector, chance, used, points, self.negligible)
+        log_weight = log_of(mixture.weight)[..., None] + log_mass
+        (*lead, count, classes), n = log_weight.shape, mean.shape[-1]
+        size = count * classes
+        flat = log_weight.reshape(*lead, size)
+        top = flat.max(-1, keepdims=True)
+        weight = np.exp(flat - top)
+        total = weight.sum(-1, keepdims=True)
+        cut = Mixture(weight / total, mean.reshape(*lead, size, n), cov.reshape(*lead, size, n, n))
+        log_likelihood = (np.log(total) + top)[..., 0] - np.log(mixture.weight.sum(-1))
+        return cut, SampledEvidence(np.asarray(log_likelihood), share.reshape(*lead, size))
 
 
 def _split(

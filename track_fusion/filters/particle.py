@@ -1,25 +1,31 @@
 """The sampling-importance-resampling (SIR) particle filter, in the log domain, batched over runs.
 
-Every function that draws takes a generator, or one generator a run: a run then draws the same numbers
-whatever batch it is computed in.
+Whatever draws takes a generator, or one generator a run: a run then draws the same numbers whatever batch it is
+computed in.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.log_domain import log_of, log_sum_exp
-from track_fusion.linalg import Array, cholesky, symmetrise, transpose
+from track_fusion.densities.mixture.mixture import Mixture
+from track_fusion.filters.base import Density, Evidence
+from track_fusion.linalg import Array, cholesky, sample_moments, transpose
 from track_fusion.models.base import Sensor, Transition
-from track_fusion.random_streams import Generators, exponentials, normals, uniforms
+from track_fusion.params import param
+from track_fusion.random_streams import Generators, RandomParams, exponentials, normals, stream, uniforms
 
 LOG_2PI = float(np.log(2.0 * np.pi))
 #: The largest double below one.
 BELOW_ONE = float(np.nextafter(1.0, 0.0))
+#: The smallest weight of a component.
+TINY = float(np.finfo(float).tiny)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +40,7 @@ class Particles:
 
     points: Array
     log_weight: Array
+    dof: ClassVar[float] = np.inf
 
     @property
     def count(self) -> int:
@@ -45,84 +52,26 @@ class Particles:
         """Weights (..., N)."""
         return np.exp(self.log_weight)
 
+    @property
+    def moments(self) -> tuple[Array, Array]:
+        """Mean (..., n) and covariance (..., n, n): the particles' conversion to a Gaussian.
 
-def from_gaussian(mean: Array, cov: Array, rng: Generators, count: int) -> Particles:
-    """Draw `count` particles of N(mean, cov) with equal weights.
+        The covariance is that of the weighted samples; it is singular when n or fewer of them carry all weight.
+        """
+        return sample_moments(self.weight, self.points)
 
-    Parameters
-    ----------
-    mean : (..., n)
-    cov : (..., n, n)    positive definite
-    rng : Generators
-    count : int
-
-    Raises
-    ------
-    LinAlgError    a covariance is not positive definite
-    """
-    draws = normals(rng, (*mean.shape[:-1], count, mean.shape[-1]))
-    points = mean[..., None, :] + draws @ transpose(cholesky(cov))
-    return Particles(points, _even(points.shape[:-1]))
+    @property
+    def components(self) -> Mixture:
+        """The particles as components without covariance; none vanishes: one alone would be no density."""
+        n = self.points.shape[-1]
+        return Mixture(np.maximum(self.weight, TINY), self.points, np.zeros((*self.points.shape, n)))
 
 
-def _even(shape: tuple[int, ...]) -> Array:
-    return np.full(shape, -np.log(shape[-1]))
+@dataclasses.dataclass(frozen=True)
+class SirState(Particles):
+    """The particles of a filter, and the generator that it draws from."""
 
-
-def moments(particles: Particles) -> tuple[Array, Array]:
-    """Mean (..., n) and covariance (..., n, n): the particles' conversion to a Gaussian.
-
-    The covariance is that of the weighted samples; it is singular when n or fewer of them carry all weight.
-    """
-    origin = particles.points[..., :1, :]
-    offset, weight = particles.points - origin, particles.weight
-    shift = weight[..., None, :] @ offset
-    offset -= shift
-    return (origin + shift)[..., 0, :], symmetrise(transpose(weight[..., None] * offset) @ offset)
-
-
-def effective_sample_size(particles: Particles) -> Array:
-    """Return 1 / (sum of squared weights), between 1 and N: (...)."""
-    return np.asarray(np.exp(-log_sum_exp(2.0 * particles.log_weight)))
-
-
-def predict(particles: Particles, transition: Transition, rng: Generators) -> Particles:
-    """Move every particle, x' = f(x) + w, w drawn from N(0, Q).
-
-    Parameters
-    ----------
-    particles : Particles    (..., N)
-    transition : Transition
-    rng : Generators
-    """
-    points = particles.points
-    draws = normals(rng, (*points.shape[:-1], transition.noise_factor(points).shape[-1]))
-    return Particles(transition.advance(points) + transition.disturbance(points, draws), particles.log_weight)
-
-
-def update(particles: Particles, z: Array, sensor: Sensor) -> tuple[Particles, Array]:
-    """Weigh the particles by their likelihood of z = h(x) + v; nothing is resampled.
-
-    Parameters
-    ----------
-    particles : Particles    (..., N)
-    z : (..., m)
-    sensor : Sensor
-
-    Returns
-    -------
-    Particles, log-likelihood of z (...)
-
-    Notes    Several sensors are used one after the other, which multiplies their likelihoods, Li 2022 (46).
-             Weights cannot all vanish: they are kept by their logarithms.
-    """
-    residual = sensor.residual(z[..., None, :], sensor.observe(particles.points))
-    lower = cholesky(sensor.noise)
-    white = residual @ transpose(np.asarray(np.linalg.inv(lower), np.float64))
-    scale = np.log(np.diagonal(lower)).sum() + 0.5 * LOG_2PI * len(lower)
-    joint = particles.log_weight - 0.5 * (white**2).sum(-1) - scale
-    total = log_sum_exp(joint)
-    return Particles(particles.points, joint - total[..., None]), total
+    rng: Generators
 
 
 def union(sets: Sequence[Particles], weights: Array) -> Particles:
@@ -140,13 +89,18 @@ def union(sets: Sequence[Particles], weights: Array) -> Particles:
     return Particles(np.concatenate(points, -2), np.concatenate(logs, -1))
 
 
+def even(shape: tuple[int, ...]) -> Array:
+    """Logarithms of equal weights (..., N)."""
+    return np.full(shape, -np.log(shape[-1]))
+
+
 def take(particles: Particles, index: NDArray[np.intp]) -> Particles:
     """Pick particles (..., M) by index, with equal weights."""
     *lead, count, n = particles.points.shape
     sets = int(np.prod(lead))
     rows = index.reshape(sets, index.shape[-1]) + count * np.arange(sets)[:, None]
     points = particles.points.reshape(sets * count, n)[rows]
-    return Particles(points.reshape(*index.shape, n), _even(index.shape))
+    return Particles(points.reshape(*index.shape, n), even(index.shape))
 
 
 def resample_multinomial(particles: Particles, rng: Generators, count: int | None = None) -> Particles:
@@ -182,3 +136,85 @@ def _inverse_cdf(particles: Particles, position: Array) -> NDArray[np.intp]:
 
 
 RESAMPLING = {"multinomial": resample_multinomial, "systematic": resample_systematic}
+
+
+@dataclasses.dataclass(frozen=True)
+class SirParams(RandomParams):
+    """The particle filter (sampling importance resampling), which draws from the stream of seed, run and role."""
+
+    particles: int = param(500, "number of particles", low=2)
+    resampling: str = param("systematic", "how particles are drawn again", choices=tuple(RESAMPLING))
+
+
+@dataclasses.dataclass(frozen=True)
+class Sir:
+    """The particle filter; particles that were weighed are drawn again before they move on.
+
+    Attributes
+    ----------
+    params : SirParams
+    runs : tuple of int or None    the runs of a batch, (R, ...), each with its stream; None: that of `params.run` alone
+    """
+
+    params: SirParams = SirParams()
+    runs: tuple[int, ...] | None = None
+
+    def begin(self, mean: Array, cov: Array) -> SirState:
+        """Draw particles of equal weights from N(mean, cov), streams from their beginning.
+
+        Raises
+        ------
+        LinAlgError    a covariance is not positive definite
+        """
+        p, runs = self.params, self.runs
+        return self._drawn(mean, cov, p.stream() if runs is None else [stream(p.seed, run, p.role) for run in runs])
+
+    def adopt(self, state: SirState, density: Density) -> SirState:
+        """Draw from the particles of a density that consists of them, else from the Gaussian of its moments."""
+        if isinstance(density, Particles):
+            return self._resampled(density, state.rng)
+        return self._drawn(*density.moments, state.rng)
+
+    def predict(self, state: SirState, transition: Transition) -> SirState:
+        """Move every particle, x' = f(x) + w, w drawn from N(0, Q).
+
+        Parameters
+        ----------
+        state : SirState    (..., N)
+        transition : Transition
+        """
+        if (state.log_weight != state.log_weight[..., :1]).any():
+            state = self._resampled(state, state.rng)
+        points = state.points
+        draws = normals(state.rng, (*points.shape[:-1], transition.noise_factor(points).shape[-1]))
+        moved = transition.advance(points) + transition.disturbance(points, draws)
+        return SirState(moved, state.log_weight, state.rng)
+
+    def update(self, state: SirState, z: Array, sensor: Sensor) -> tuple[SirState, Evidence]:
+        """Weigh the particles by their likelihood of z = h(x) + v.
+
+        Parameters
+        ----------
+        state : SirState    (..., N)
+        z : (..., m)
+        sensor : Sensor
+
+        Notes    Several sensors are used one after the other, which multiplies their likelihoods, Li 2022 (46).
+                 Weights cannot all vanish: they are kept by their logarithms.
+        """
+        residual = sensor.residual(z[..., None, :], sensor.observe(state.points))
+        lower = cholesky(sensor.noise)
+        white = residual @ transpose(np.asarray(np.linalg.inv(lower), np.float64))
+        scale = np.log(np.diagonal(lower)).sum() + 0.5 * LOG_2PI * len(lower)
+        joint = state.log_weight - 0.5 * (white**2).sum(-1) - scale
+        total = log_sum_exp(joint)
+        return SirState(state.points, joint - total[..., None], state.rng), Evidence(total)
+
+    def _drawn(self, mean: Array, cov: Array, rng: Generators) -> SirState:
+        draws = normals(rng, (*mean.shape[:-1], self.params.particles, mean.shape[-1]))
+        points = mean[..., None, :] + draws @ transpose(cholesky(cov))
+        return SirState(points, even(points.shape[:-1]), rng)
+
+    def _resampled(self, particles: Particles, rng: Generators) -> SirState:
+        drawn = RESAMPLING[self.params.resampling](particles, rng, self.params.particles)
+        return SirState(drawn.points, drawn.log_weight, rng)

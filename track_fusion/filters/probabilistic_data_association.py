@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from track_fusion.filters.base import Gaussian
+from track_fusion.filters.extended import Extended
 from track_fusion.filters.interacting_multiple_model import reweighted
+from track_fusion.filters.kalman import joseph, linear_gain
 from track_fusion.linalg import Array, logdet, matvec, outer, solve, symmetrise, transpose
-from track_fusion.models.base import Sensor
+from track_fusion.models.base import Sensor, Transition
 from track_fusion.params import Params, param
 from track_fusion.solvers.chi_square import chi_square_quantile
 
@@ -44,44 +48,92 @@ class Association:
     log_ratio: Array
 
 
-def update(
-    mean: Array, cov: Array, zs: Array, present: NDArray[np.bool_], sensor: Sensor, params: ClutterParams
-) -> tuple[Array, Array, Association]:
-    """Condition on a scan of which at most one detection is the target's, the rest clutter.
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """A target that may be there.
 
-    Parameters
+    Attributes
     ----------
     mean : (..., n)
     cov : (..., n, n)
-    zs : (..., D, m)             detections; each track may have its own candidates
-    present : (..., D) bool      which of them are there (padding is not); D may be 0
-    sensor : Sensor              linearised at the mean
-    params : ClutterParams
-
-    Returns
-    -------
-    mean (..., n), cov (..., n, n), Association
-
-    Notes         Clutter is Poisson, uniform in the gate. The posterior mixture of D + 1 Gaussians is merged; but for
-                  that and the linearisation it is exact. Another target's detections count as clutter, so targets
-                  must be farther apart than their gates.
-    References    Y. Bar-Shalom, F. Daum, J. Huang, The probabilistic data association filter, 2009; Sharma 6.4.
+    existence : (...)    probability that it is
     """
-    slope, size = sensor.jacobian(mean), sensor.noise.shape[-1]
-    residual = sensor.residual(zs, sensor.observe(mean)[..., None, :])
-    spread = symmetrise(slope @ cov @ transpose(slope) + sensor.noise)
-    gain = transpose(solve(spread, slope @ cov))
-    distance = (residual * transpose(solve(spread, transpose(residual)))).sum(-1)
-    gated = present & (distance <= chi_square_quantile(params.gate_probability, size))
-    weight, log_ratio = _weights(distance, gated, logdet(spread), size, params)
-    part = weight[..., :-1, None]
-    shift = (part * residual).sum(-2)
-    keep = np.eye(mean.shape[-1]) - gain @ slope
-    sharpened = keep @ cov @ transpose(keep) + gain @ sensor.noise @ transpose(gain)
-    missed = weight[..., -1, None, None]
-    scatter = transpose(part * residual) @ residual - outer(shift)
-    posterior = missed * cov + (1.0 - missed) * sharpened + gain @ scatter @ transpose(gain)
-    return mean + matvec(gain, shift), symmetrise(posterior), Association(weight, gated, log_ratio)
+
+    mean: Array
+    cov: Array
+    existence: Array
+
+    @property
+    def moments(self) -> tuple[Array, Array]:
+        """Mean (..., n) and covariance (..., n, n) of the target, if it is there."""
+        return self.mean, self.cov
+
+
+class Scan(NamedTuple):
+    """Detections (..., D, m), each track may have its own; which are there, (..., D): padding is not; D may be 0."""
+
+    values: Array
+    present: NDArray[np.bool_]
+
+
+C = TypeVar("C", bound=Candidate)
+
+
+@dataclasses.dataclass(frozen=True)
+class ProbabilisticDataAssociation:
+    """The PDA filter on models linearised at the mean.
+
+    References    Y. Bar-Shalom, F. Daum, J. Huang, The probabilistic data association filter, 2009; Sharma 6.4; for
+                  the existence D. Musicki, R. Evans, S. Stankovic, Integrated probabilistic data association, 1994.
+    """
+
+    params: ClutterParams = ClutterParams()
+
+    def predict(self, state: C, transition: Transition) -> C:
+        """Predict by one scan; a target may vanish.
+
+        Parameters
+        ----------
+        state : Candidate    (..., n)
+        transition : Transition
+        """
+        moved = Extended().predict(Gaussian(state.mean, state.cov), transition)
+        existence = state.existence * self.params.survival_probability
+        return dataclasses.replace(state, mean=moved.mean, cov=moved.cov, existence=existence)
+
+    def update(self, state: C, scan: Scan, sensor: Sensor) -> tuple[C, Association]:
+        """Condition on a scan of which at most one detection is the target's, the rest clutter.
+
+        Parameters
+        ----------
+        state : Candidate    (..., n)
+        scan : Scan          (..., D)
+        sensor : Sensor
+
+        Notes    Clutter is Poisson, uniform in the gate. The posterior mixture of D + 1 Gaussians is merged; but for
+                 that and the linearisation it is exact. Another target's detections count as clutter, so targets
+                 must be farther apart than their gates.
+        """
+        mean, cov, params = state.mean, state.cov, self.params
+        slope, size = sensor.jacobian(mean), sensor.noise.shape[-1]
+        residual = sensor.residual(scan.values, sensor.observe(mean)[..., None, :])
+        gain, spread = linear_gain(cov, slope, sensor.noise)
+        distance = (residual * transpose(solve(spread, transpose(residual)))).sum(-1)
+        gated = scan.present & (distance <= chi_square_quantile(params.gate_probability, size))
+        weight, log_ratio = _weights(distance, gated, logdet(spread), size, params)
+        part = weight[..., :-1, None]
+        shift = (part * residual).sum(-2)
+        missed = weight[..., -1, None, None]
+        scatter = transpose(part * residual) @ residual - outer(shift)
+        mixed = missed * cov + (1.0 - missed) * joseph(cov, gain, slope, sensor.noise)
+        posterior = symmetrise(mixed + gain @ scatter @ transpose(gain))
+        existence = update_existence(state.existence, log_ratio)
+        updated = dataclasses.replace(state, mean=mean + matvec(gain, shift), cov=posterior, existence=existence)
+        return updated, Association(weight, gated, log_ratio)
+
+    def missed(self, state: C) -> C:
+        """Update by a scan without a detection in the gate, which leaves mean and covariance as they are."""
+        return dataclasses.replace(state, existence=update_existence(state.existence, np.array(_missed(self.params))))
 
 
 def _weights(
@@ -92,25 +144,17 @@ def _weights(
         scale = np.log(params.detection_probability) - np.log(params.clutter_density)
     density = -0.5 * (distance + log_det[..., None] + size * np.log(2.0 * np.pi))
     log_weight = np.where(gated, scale + density, -np.inf)
-    none = np.full((*log_weight.shape[:-1], 1), missed_log_ratio(params))
+    none = np.full((*log_weight.shape[:-1], 1), _missed(params))
     return reweighted(np.ones(1), np.concatenate([log_weight, none], -1))
 
 
-def missed_log_ratio(params: ClutterParams) -> float:
-    """Log-likelihood ratio of a scan without a detection in the gate: such a scan leaves mean and cov as they are."""
+def _missed(params: ClutterParams) -> float:
+    """Log-likelihood ratio of a scan without a detection in the gate."""
     with np.errstate(divide="ignore"):
         return float(np.log1p(-params.detection_probability * params.gate_probability))
 
 
-def predict_existence(existence: Array, params: ClutterParams) -> Array:
-    """Existence probability (...) one scan later."""
-    return np.asarray(existence * params.survival_probability)
-
-
 def update_existence(existence: Array, log_ratio: Array) -> Array:
-    """Existence probability (...) after a scan.
-
-    References    D. Musicki, R. Evans, S. Stankovic, Integrated probabilistic data association, 1994.
-    """
+    """Existence probability (...) after a scan of this log-likelihood ratio, target there against not there."""
     ratio = np.exp(np.minimum(log_ratio, 700.0))
     return np.asarray(existence * ratio / (1.0 - existence + existence * ratio))

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from abc import ABC, abstractmethod
 
 import numpy as np
 
-from track_fusion.filters.kalman import Innovation
+from track_fusion.filters.base import Gaussian, GaussianFilter, Innovation
 from track_fusion.linalg import Array, cholesky, mahalanobis_squared, matvec, solve, symmetrise, transpose
 from track_fusion.models.base import Sensor, Transition
 
@@ -38,15 +39,6 @@ class SigmaPoints:
         return np.asarray(transpose(self.cov_weight[:, None] * a) @ b)
 
 
-def predict(mean: Array, cov: Array, transition: Transition, points: SigmaPoints) -> tuple[Array, Array]:
-    """Predict x' = f(x) + w: moments of f at the points, plus Q; shapes (..., n), (..., n, n)."""
-    moved = transition.advance(points.of(mean, cholesky(cov)))
-    origin = moved[..., :1, :]
-    shift = points.mean(moved - origin)
-    deviation = moved - origin - shift[..., None, :]
-    return origin[..., 0, :] + shift, symmetrise(points.cross(deviation, deviation) + transition.noise(mean))
-
-
 def expected_measurement(mean: Array, sigma: Array, sensor: Sensor, points: SigmaPoints) -> tuple[Array, Array]:
     """Return the expected measurement (..., m) and its deviations at the points (..., P, m), angles wrapped."""
     reference = sensor.observe(mean)
@@ -55,19 +47,49 @@ def expected_measurement(mean: Array, sigma: Array, sensor: Sensor, points: Sigm
     return reference + shift, turned - shift[..., None, :]
 
 
-def update(mean: Array, cov: Array, z: Array, sensor: Sensor, points: SigmaPoints) -> tuple[Array, Array, Innovation]:
-    """Condition on z = h(x) + v by the joint Gaussian that the points give.
+class SigmaPointFilter(GaussianFilter, ABC):
+    """A filter that a choice of points makes; it raises a LinAlgError where a covariance is not positive definite."""
 
-    The posterior covariance is summed from the points' remaining deviations, so that it stays definite when
-    all weights are positive.
-    """
-    sigma = points.of(mean, cholesky(cov))
-    expected, seen = expected_measurement(mean, sigma, sensor, points)
-    offset = sigma - mean[..., None, :]
-    spread = symmetrise(points.cross(seen, seen) + sensor.noise)
-    gain = transpose(solve(spread, points.cross(seen, offset)))
-    left = offset - seen @ transpose(gain)
-    posterior = symmetrise(points.cross(left, left) + gain @ sensor.noise @ transpose(gain))
-    residual = sensor.residual(z, expected)
-    innovation = Innovation(residual, spread, mahalanobis_squared(residual, spread))
-    return mean + matvec(gain, residual), posterior, innovation
+    @abstractmethod
+    def points(self, size: int) -> SigmaPoints:
+        """Return the points for n axes."""
+
+    def predict(self, state: Gaussian, transition: Transition) -> Gaussian:
+        """Predict x' = f(x) + w: moments of f at the points, plus Q.
+
+        Parameters
+        ----------
+        state : Gaussian    (..., n)
+        transition : Transition
+        """
+        points = self.points(state.mean.shape[-1])
+        moved = transition.advance(points.of(state.mean, cholesky(state.cov)))
+        origin = moved[..., :1, :]
+        shift = points.mean(moved - origin)
+        deviation = moved - origin - shift[..., None, :]
+        cov = symmetrise(points.cross(deviation, deviation) + transition.noise(state.mean))
+        return Gaussian(origin[..., 0, :] + shift, cov, state.dof)
+
+    def update(self, state: Gaussian, z: Array, sensor: Sensor) -> tuple[Gaussian, Innovation]:
+        """Condition on z = h(x) + v by the joint Gaussian that the points give.
+
+        Angles are averaged about the measurement of the mean and wrapped. The posterior covariance is summed from the
+        points' remaining deviations, so that it stays definite when all weights are positive.
+
+        Parameters
+        ----------
+        state : Gaussian    (..., n)
+        z : (..., m)
+        sensor : Sensor
+        """
+        points, mean = self.points(state.mean.shape[-1]), state.mean
+        sigma = points.of(mean, cholesky(state.cov))
+        expected, seen = expected_measurement(mean, sigma, sensor, points)
+        offset = sigma - mean[..., None, :]
+        spread = symmetrise(points.cross(seen, seen) + sensor.noise)
+        gain = transpose(solve(spread, points.cross(seen, offset)))
+        left = offset - seen @ transpose(gain)
+        posterior = symmetrise(points.cross(left, left) + gain @ sensor.noise @ transpose(gain))
+        residual = sensor.residual(z, expected)
+        innovation = Innovation(residual, spread, mahalanobis_squared(residual, spread))
+        return Gaussian(mean + matvec(gain, residual), posterior, state.dof), innovation

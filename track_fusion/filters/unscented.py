@@ -7,11 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from track_fusion.filters import sigma_points
-from track_fusion.filters.kalman import Innovation
-from track_fusion.filters.sigma_points import SigmaPoints
-from track_fusion.linalg import Array
-from track_fusion.models.base import Sensor, Transition
+from track_fusion.filters.sigma_points import SigmaPointFilter, SigmaPoints
 from track_fusion.params import Params, param
 
 
@@ -43,51 +39,15 @@ def points(size: int, params: UnscentedParams) -> SigmaPoints:
     return SigmaPoints(np.concatenate([np.zeros((1, size)), arms]), mean_weight, cov_weight)
 
 
-DEFAULTS = UnscentedParams()
-
-
-def predict(mean: Array, cov: Array, transition: Transition, params: UnscentedParams = DEFAULTS) -> tuple[Array, Array]:
-    """Predict x' = f(x) + w.
-
-    Parameters
-    ----------
-    mean : (..., n)
-    cov : (..., n, n)
-    transition : Transition
-    params : UnscentedParams
-
-    Returns
-    -------
-    mean (..., n), cov (..., n, n)    definite for certain only if no weight is negative
-
-    Raises
-    ------
-    LinAlgError    a covariance is not positive definite
+@dataclasses.dataclass(frozen=True)
+class Unscented(SigmaPointFilter):
+    """The unscented Kalman filter; covariances are definite for certain only if no weight is negative.
 
     References     S. J. Julier, J. K. Uhlmann, Unscented filtering and nonlinear estimation, 2004.
     """
-    return sigma_points.predict(mean, cov, transition, points(mean.shape[-1], params))
 
+    params: UnscentedParams = UnscentedParams()
 
-def update(
-    mean: Array, cov: Array, z: Array, sensor: Sensor, params: UnscentedParams = DEFAULTS
-) -> tuple[Array, Array, Innovation]:
-    """Condition on z = h(x) + v; angles are averaged about the measurement of the mean and wrapped.
-
-    Parameters
-    ----------
-    mean : (..., n)
-    cov : (..., n, n)
-    z : (..., m)
-    sensor : Sensor
-    params : UnscentedParams
-
-    Returns
-    -------
-    mean (..., n), cov (..., n, n), Innovation
-
-    Raises
-    ------
-    LinAlgError    a covariance is not positive definite
-    """
-    return sigma_points.update(mean, cov, z, sensor, points(mean.shape[-1], params))
+    def points(self, size: int) -> SigmaPoints:
+        """Return the 2 n + 1 points for n axes."""
+        return points(size, self.params)

@@ -9,6 +9,9 @@ import numpy as np
 
 from track_fusion.linalg import Array
 
+#: So many standard errors from a bound leave no doubt on which side a figure lies.
+BEYOND_DOUBT = 3.0
+
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
@@ -63,6 +66,10 @@ class Estimate:
     def ratio(cls, numerator: Array, denominator: Array) -> Estimate:
         """Ratio of two averages over the same runs, (R,) each."""
         return cls.of_averages(np.stack([numerator, denominator], -1), lambda mean: mean[:, 0] / mean[:, 1])
+
+    def exceeds(self, bound: float) -> bool:
+        """Tell whether the figure is above a bound beyond doubt: by more than BEYOND_DOUBT standard errors."""
+        return bool(self.value - BEYOND_DOUBT * np.nan_to_num(self.standard_error) > bound)
 
     def spread(self, runs: int) -> float:
         """Standard deviation that the figure would have in a study of so many runs."""

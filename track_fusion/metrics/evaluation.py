@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import defaultdict
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from track_fusion.association.assignment import nearest_pairs
 from track_fusion.linalg import Array
-from track_fusion.metrics.consistency import Consistency, consistency, consistency_of_sum, nees
+from track_fusion.metrics.consistency import Consistency, consistency, consistency_of_sum
+from track_fusion.metrics.pairing import paired
 from track_fusion.params import Params, param
 from track_fusion.solvers.chi_square import chi_square_quantile
 from track_fusion.tracks import StateLayout, TrackBatch
@@ -37,6 +37,15 @@ class EvaluationParams(Params):
     confirmed_only: bool = param(True, "judge confirmed tracks only")
 
 
+class Sample(NamedTuple):
+    """A target with its track at one time: identifiers, error (n,), NEES."""
+
+    target: int
+    track: int
+    error: Array
+    nees: float
+
+
 class Evaluation:
     """Collects truth and tracks by stamp, in any order, and judges each time at which both are there.
 
@@ -47,7 +56,7 @@ class Evaluation:
         self._layout, self._params = layout, params
         self._truth: dict[int, list[TrackBatch]] = defaultdict(list)
         self._tracks: dict[int, TrackBatch] = {}
-        self._judged: dict[int, list[tuple[int, int, Array, float]]] = {}  # time -> (target, track, error, nees)
+        self._judged: dict[int, list[Sample]] = {}
         self._nees_sum, self._samples_judged = 0.0, 0
 
     @property
@@ -73,24 +82,14 @@ class Evaluation:
         if stamp_ns not in self._tracks or stamp_ns not in self._truth:
             return
         truth, tracks = TrackBatch.concatenate(self._truth[stamp_ns]), self._tracks[stamp_ns]
-        true_state = truth.moments[0]
-        mean, cov = tracks.moments
-        at = list(self._layout.position)
-        target, track = nearest_pairs(true_state[:, at], mean[:, at], self._params.max_distance_m)
-        error = mean[track] - true_state[target]
-        turned = self._layout.angular
-        error[:, turned] = np.remainder(error[:, turned] + np.pi, 2 * np.pi) - np.pi
-        values = nees(error, cov[track])
+        pairs = paired(self._layout, truth.moments[0], *tracks.moments, self._params.max_distance_m)
         before = self._judged.get(stamp_ns, [])
         self._judged[stamp_ns] = [
-            (int(truth.track_id[i]), int(tracks.track_id[j]), e, float(v))
-            for i, j, e, v in zip(target, track, error, values, strict=True)
+            Sample(int(truth.track_id[i]), int(tracks.track_id[j]), error, float(score))
+            for i, j, error, score in zip(*pairs, strict=True)
         ]
-        self._nees_sum += float(values.sum()) - sum(sample[-1] for sample in before)
-        self._samples_judged += len(values) - len(before)
-
-    def _samples(self) -> list[tuple[int, int, int, Array, float]]:
-        return [(t, *sample) for t, samples in sorted(self._judged.items()) for sample in samples]
+        self._nees_sum += float(pairs.nees.sum()) - sum(sample.nees for sample in before)
+        self._samples_judged += len(pairs.nees) - len(before)
 
     def consistency(self) -> Consistency:
         """ANEES over all targets and times; kept up to date, since a node asks at every message."""
@@ -98,14 +97,14 @@ class Evaluation:
 
     def is_overconfident(self) -> bool:
         """Tell whether errors are larger than the covariances say, on enough samples and beyond doubt."""
-        found = self.consistency()
-        terms = found.samples * found.axes
-        return found.samples >= MIN_SAMPLES and found.anees > chi_square_quantile(1.0 - FALSE_ALARM, terms) / terms
+        score = self.consistency()
+        terms = score.samples * score.axes
+        return score.samples >= MIN_SAMPLES and score.anees > chi_square_quantile(1.0 - FALSE_ALARM, terms) / terms
 
     def result(self) -> dict[str, Any]:
         """Everything as JSON-ready values: figures over all and for each target, unmatched tracks and targets."""
-        samples = self._samples()
-        targets = sorted({s[1] for s in samples})
+        samples = [sample for _, at_once in sorted(self._judged.items()) for sample in at_once]
+        targets = sorted({s.target for s in samples})
         matched = len(samples)
         truths = sum(len(b) for t in self._judged for b in self._truth[t])
         published = sum(len(self._tracks[t]) for t in self._judged)
@@ -116,16 +115,16 @@ class Evaluation:
             "false": published - matched,
             "all": self._figures(samples),
             "targets": {
-                str(t): self._figures([s for s in samples if s[1] == t])
-                | {"track_ids": sorted({s[2] for s in samples if s[1] == t})}
+                str(t): self._figures([s for s in samples if s.target == t])
+                | {"track_ids": sorted({s.track for s in samples if s.target == t})}
                 for t in targets
             },
         }
 
-    def _figures(self, samples: list[tuple[int, int, int, Array, float]]) -> dict[str, Any]:
+    def _figures(self, samples: list[Sample]) -> dict[str, Any]:
         """RMSE, mean error norm (the one-run ARMSE) and consistency of some samples."""
-        errors = np.array([s[3] for s in samples]).reshape(-1, self._layout.size)
-        found = consistency(np.array([s[4] for s in samples]), self._layout.size)
+        errors = np.array([s.error for s in samples]).reshape(-1, self._layout.size)
+        score = consistency(np.array([s.nees for s in samples]), self._layout.size)
         figures: dict[str, Any] = {"samples": len(samples)}
         rate = tuple(i for i, name in enumerate(self._layout.axes) if name == "turn_rate")
         quantities = [("position", self._layout.position, "m", 1.0), ("velocity", self._layout.velocity, "mps", 1.0)]
@@ -135,8 +134,8 @@ class Evaluation:
             figures[f"{name}_rmse_{unit}"] = _number(np.sqrt((norm**2).mean()) if len(norm) else math.nan)
             figures[f"{name}_armse_{unit}"] = _number(norm.mean() if len(norm) else math.nan)
         figures |= {
-            "anees": _number(found.anees), "anees_low": _number(found.low), "anees_high": _number(found.high),
-            "verdict": found.verdict,
+            "anees": _number(score.anees), "anees_low": _number(score.low), "anees_high": _number(score.high),
+            "verdict": score.verdict,
         }  # fmt: skip
         return figures
 

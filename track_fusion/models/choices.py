@@ -15,6 +15,7 @@ from track_fusion.models.measurement import LinearSensor, RangeBearingSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams, KnownTurn, KnownTurnParams
 from track_fusion.params import ParameterError, Params, param
+from track_fusion.plugins import Registry
 from track_fusion.tracks import StateLayout
 
 T = TypeVar("T")
@@ -42,19 +43,24 @@ def square_matrix(name: str, values: tuple[float, ...], size: int) -> Array:
 
 
 #: Motions by key, made from (layout, params).
-MOTIONS: Mapping[str, Choice[Motion]] = {
-    "nearly_constant_velocity": Choice(MotionParams, NearlyConstantVelocity),
-    "coordinated_turn": Choice(CoordinatedTurnParams, CoordinatedTurn),
-    "known_turn": Choice(KnownTurnParams, KnownTurn),
-    "constant_turn_rate_and_speed": Choice(TurnRateAndSpeedParams, ConstantTurnRateAndSpeed),
-}
+MOTIONS: Registry[Choice[Motion]] = Registry(
+    "track_fusion.motions",
+    "motion",
+    Choice,
+    {
+        "nearly_constant_velocity": Choice(MotionParams, NearlyConstantVelocity),
+        "coordinated_turn": Choice(CoordinatedTurnParams, CoordinatedTurn),
+        "known_turn": Choice(KnownTurnParams, KnownTurn),
+        "constant_turn_rate_and_speed": Choice(TurnRateAndSpeedParams, ConstantTurnRateAndSpeed),
+    },
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class MotionChoice(Params):
     """How targets move."""
 
-    motion: str = param("nearly_constant_velocity", "the motion model", choices=tuple(MOTIONS))
+    motion: str = param("nearly_constant_velocity", "the motion model", choices=MOTIONS)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,12 +26,6 @@ class SoftmaxDetector:
     bias: Array
 
     @classmethod
-    def binary(cls, direction: Array, offset: float) -> SoftmaxDetector:
-        """Two classes: P(class 0 | x) = 1 / (1 + exp(direction'x + offset)), direction (n,)."""
-        direction = np.asarray(direction, float)
-        return cls(np.stack([np.zeros_like(direction), direction]), np.array([0.0, offset]))
-
-    @classmethod
     def view_cone(
         cls,
         layout: StateLayout,

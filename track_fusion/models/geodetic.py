@@ -1,4 +1,4 @@
-"""Geodetic coordinates (WGS 84) to a local east-north-up frame and back; needs pymap3d."""
+"""Geodetic coordinates (WGS 84) to a local east-north-up frame; needs pymap3d."""
 
 from __future__ import annotations
 
@@ -45,9 +45,3 @@ class LocalFrame:
         parts = (np.ascontiguousarray(geodetic[..., i]) for i in range(3))
         origin = self.latitude_deg, self.longitude_deg, self.altitude_m
         return np.stack(_pymap3d().geodetic2enu(*parts, *origin), -1).reshape(geodetic.shape)
-
-    def geodetic_from_enu(self, enu: Array) -> Array:
-        """Turn east, north, up (m), (..., 3), into latitude, longitude (degrees) and altitude (m), (..., 3)."""
-        parts = (np.ascontiguousarray(enu[..., i]) for i in range(3))
-        origin = self.latitude_deg, self.longitude_deg, self.altitude_m
-        return np.stack(_pymap3d().enu2geodetic(*parts, *origin), -1).reshape(enu.shape)

@@ -14,7 +14,8 @@ from msg_adapters.header import stamp_to_ns
 from msg_adapters.odometry import odometry_from_msg
 from msg_adapters.track_table import track_table_from_msg
 from track_fusion.metrics.evaluation import Evaluation, EvaluationParams
-from track_fusion.nodes.managed import ManagedNode, end, run
+from track_fusion.nodes.managed import ManagedNode
+from track_fusion.nodes.process import end, run
 from track_fusion.nodes.ros_params import declare
 from track_fusion.nodes.screening import FrameParams, screened_tracks
 from track_fusion.params import Params, param
@@ -83,9 +84,9 @@ class EvaluatorNode(ManagedNode):
 
     def diagnose(self) -> tuple[list[str], dict[str, Any]]:
         """Report the consistency so far."""
-        found = self.evaluation.consistency()
+        consistency = self.evaluation.consistency()
         overconfident = self.evaluation.is_overconfident()
-        values = {"times": self.evaluation.times, "anees": found.anees, "anees_high": found.high}
+        values = {"times": self.evaluation.times, "anees": consistency.anees, "anees_high": consistency.high}
         return (["overconfident"] if overconfident else []), values
 
 

@@ -12,31 +12,36 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from msg_adapters.arrays import TrackArrays
+from msg_adapters.arrays import CrossBlock
 from msg_adapters.header import check_header
 from msg_adapters.markers import markers_to_msg
-from msg_adapters.odometry import CrossBlock, odometry_from_msg, odometry_to_msgs
-from msg_adapters.track_table import track_table_from_msg, track_table_to_msg
+from msg_adapters.odometry import odometry_to_msgs
+from msg_adapters.track_table import track_table_to_msg
+from msg_adapters.types import MESSAGE_TYPES, MessageType
 from track_fusion.centre.centre import FusionCentre
 from track_fusion.centre.config import (
     MAX_SOURCES,
     CentreConfig,
     FusionCentreParams,
-    RuleParams,
     ScanBufferParams,
     SourceConfig,
+    StateFusionParams,
     TrackManagerParams,
 )
 from track_fusion.centre.publish import StepInfo
 from track_fusion.models.choices import MOTIONS, MotionChoice
-from track_fusion.nodes.managed import ManagedNode, end, run
+from track_fusion.nodes.managed import ManagedNode
+from track_fusion.nodes.process import end, run
 from track_fusion.nodes.ros_params import chosen, declare
 from track_fusion.nodes.screening import FrameParams, screened_tracks
 from track_fusion.params import ParameterError, Params, param
+from track_fusion.plugins import Registry
 from track_fusion.random_streams import RandomParams
 from track_fusion.rules import RULES
 from track_fusion.tracks import StateLayout, TrackBatch
 
+#: Message types of sources by key, those of other packages included.
+SOURCE_TYPES: Registry[MessageType] = Registry("track_fusion.adapters", "source type", MessageType, MESSAGE_TYPES)
 #: How often waiting scans and silent sources are looked at, in ROS time.
 LOOK_PERIOD_S = 0.02
 
@@ -52,7 +57,7 @@ class SourceParams(Params):
         (),
         "message type of each source: track_table (the full posterior) or odometry (one message a track); "
         "empty: all track_table",
-        choices=("track_table", "odometry"),
+        choices=SOURCE_TYPES,
         kind=str,
     )
     cross_block: str = param(
@@ -76,9 +81,9 @@ class SourceParams(Params):
             )
 
     @property
-    def kinds(self) -> tuple[str, ...]:
+    def kinds(self) -> list[MessageType]:
         """Message type of each source."""
-        return self.source_types or ("track_table",) * len(self.source_configurations)
+        return [SOURCE_TYPES[key] for key in self.source_types or ("track_table",) * len(self.source_configurations)]
 
 
 class FusionCentreNode(ManagedNode):
@@ -87,11 +92,13 @@ class FusionCentreNode(ManagedNode):
     def declare_parameters_(self) -> None:
         """Declare parameters and build the centre."""
         self.frame, self.sources = declare(self, FrameParams), declare(self, SourceParams)
+        self.kinds = self.sources.kinds
         motion = chosen(self, MOTIONS, declare(self, MotionChoice).motion, StateLayout(self.frame.axes))
-        rule = RULES[declare(self, RuleParams).state_fusion]
-        rule_params = {key: declare(self, each.params, f"{key}.") for key, each in RULES.items()}
-        names = zip(self.sources.source_configurations, self.sources.kinds, strict=True)
-        sources = tuple(SourceConfig(name, assembles=kind == "odometry") for name, kind in names)
+        rule = RULES[declare(self, StateFusionParams).state_fusion]
+        rules = {**RULES.own, rule.key: rule}
+        rule_params = {key: declare(self, each.params, f"{key}.") for key, each in rules.items()}
+        names = zip(self.sources.source_configurations, self.kinds, strict=True)
+        sources = tuple(SourceConfig(name, assembles=not kind.whole_scan) for name, kind in names)
         self.centre = FusionCentre(
             CentreConfig(
                 sources, motion, self.frame.frame_id, rule, rule_params[rule.key], declare(self, FusionCentreParams),
@@ -106,9 +113,12 @@ class FusionCentreNode(ManagedNode):
         self._tracks = self.publisher(PointCloud2, "~/tracks", expected=self.managed.expected_subscribers)
         self._odometry = self.publisher(Odometry, "~/odometry")
         self._markers = self.publisher(MarkerArray, "~/markers")
-        for k, (name, kind) in enumerate(zip(self.sources.source_configurations, self.sources.kinds, strict=True)):
-            message = PointCloud2 if kind == "track_table" else Odometry
-            depth = 10 if kind == "track_table" else 1000  # a scan of Odometry is a message a track
+        for k, (name, kind) in enumerate(zip(self.sources.source_configurations, self.kinds, strict=True)):
+            try:
+                message = kind.load()
+            except ImportError as error:
+                raise ParameterError(f"The 'source_types' parameter: {error}") from error
+            depth = 10 if kind.whole_scan else 1000  # of a scan in pieces, each is a message
             lost = SubscriptionEventCallbacks(message_lost=self._on_lost)
             self.subscribe(message, f"~/sources/{name}/tracks", self._reader(k, kind), depth, event_callbacks=lost)
         self.create_timer(LOOK_PERIOD_S, self._on_timer)
@@ -125,22 +135,20 @@ class FusionCentreNode(ManagedNode):
             {"lost_in_transport": event.total_count_change}, "a queue was full: raise its depth by a QoS override"
         )
 
-    def _reader(self, source: int, kind: str) -> Callable[[Any], None]:
+    def _reader(self, source: int, kind: MessageType) -> Callable[[Any], None]:
+        cross_block: CrossBlock = "conservative" if self.sources.cross_block == "conservative" else "block_diagonal"
+
         def read(msg: Any) -> None:
             now = self.now_ns()
             stamp_ns = check_header(
                 msg.header, frame_id=self.frame.frame_id, now_ns=now, max_future_ns=self.frame.max_future_ns
             )
-            arrays = track_table_from_msg(msg) if kind == "track_table" else self._read_odometry(msg)
-            self._take(source, screened_tracks(self, arrays, self.centre.config.layout), stamp_ns, now)
+            tracks, supplied = kind.read(msg, self.centre.config.layout.axes, cross_block)
+            if kind.lacks:
+                self.counted[f"{kind.lacks}_absent"] += supplied
+            self._take(source, screened_tracks(self, tracks, self.centre.config.layout), stamp_ns, now)
 
         return read
-
-    def _read_odometry(self, msg: Any) -> TrackArrays:
-        cross_block: CrossBlock = "conservative" if self.sources.cross_block == "conservative" else "block_diagonal"
-        reading = odometry_from_msg(msg, self.centre.config.layout.axes, cross_block)
-        self.counted["cross_block_absent"] += reading.cross_block_absent
-        return reading.tracks
 
     def _take(self, source: int, scan: TrackBatch, stamp_ns: int, now_ns: int) -> None:
         now_ns = max(now_ns, stamp_ns)
@@ -188,7 +196,7 @@ class FusionCentreNode(ManagedNode):
         values: dict[str, Any] = {"rule": rule.key, "tracks": len(self.centre.tracks)}
         values["step_s"] = round(self._latency_s, 6)
         for k, name in enumerate(self.sources.source_configurations):
-            silence = self.centre.silence_s(k, self.now_ns())
+            silence = self.centre.buffer.silence_s(k, self.now_ns())
             values[f"silence_s/{name}"] = round(silence, 3)
             if silence >= timeout_s:
                 warnings.append(f"{name} is silent for {silence:.1f} s")

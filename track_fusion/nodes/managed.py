@@ -1,37 +1,30 @@
-"""What all nodes share: lifecycle with autostart, counted rejections, diagnostics, a clean end."""
+"""What all nodes share: lifecycle with autostart, input held back, counted rejections, diagnostics."""
 
 from __future__ import annotations
 
 import dataclasses
-import os
-import signal
-import sys
 import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any
 
-import rclpy
 import rclpy.utilities
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock, JumpThreshold
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from msg_adapters.arrays import MessageError
 from msg_adapters.diagnostics import diagnostic_array
+from msg_adapters.types import message_class
 from track_fusion.nodes.ros_params import declare, refuse_unknown
-from track_fusion.params import ParameterError, Params, param
+from track_fusion.params import Fault, ParameterError, Params, param
 
 DIAGNOSTICS_PERIOD_S = 1.0
-#: A signal takes effect on the context within this time.
-SIGNAL_LAG_S = 0.5
 #: How often a held-back message looks whether the clock and the subscribers are there.
 LOOK_PERIOD_S = 0.02
 #: So many messages are held back at most; later ones are rejected.
@@ -53,16 +46,24 @@ class ManagedParams(Params):
     )
 
 
-RCLError: type[Exception] = rclpy_implementation.RCLError
-
-
-class Fault(Exception):
-    """An error that ends the node with exit code 1; its text is the reason."""
-
-
 def qos(depth: int) -> QoSProfile:
     """Reliable, keep the last `depth`: the default of every topic of this package."""
     return QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=depth)
+
+
+def class_of(kind: str) -> type:
+    """Return the class of a type such as sensor_msgs/msg/PointCloud2.
+
+    Raises
+    ------
+    Fault    its package is not installed
+    """
+    try:
+        return message_class(kind)
+    except ImportError as error:
+        raise Fault(
+            f"The type {kind} cannot be had. {error} Or leave its topics out (of a bag: by bag_topics)."
+        ) from None
 
 
 class ManagedNode(LifecycleNode):
@@ -88,11 +89,11 @@ class ManagedNode(LifecycleNode):
         self.declare_parameters_()
         refuse_unknown(self)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos(10))
-        self.create_timer(DIAGNOSTICS_PERIOD_S, self._publish_diagnostics, clock=self._wall)
+        self.every(DIAGNOSTICS_PERIOD_S, self._publish_diagnostics)
         backward = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
         self._jump = self.get_clock().create_jump_callback(backward, post_callback=self._on_jump)
         if self.managed.autostart:
-            self.autostart()
+            self._autostart()
 
     # What subclasses fill in.
 
@@ -120,14 +121,8 @@ class ManagedNode(LifecycleNode):
 
     # Lifecycle.
 
-    def autostart(self) -> None:
-        """Configure and activate; rclpy has no such thing.
-
-        Raises
-        ------
-        Fault             a transition failed (an unforeseen error is in the log)
-        ParameterError    it failed because a value is wrong
-        """
+    def _autostart(self) -> None:
+        """Configure and activate; rclpy has no such thing. Raise what made it fail; the log has an unforeseen error."""
         transitions: list[Callable[[], Any]] = [self.trigger_configure, self.trigger_activate]
         for transition in transitions:
             if transition() != TransitionCallbackReturn.SUCCESS:
@@ -173,9 +168,8 @@ class ManagedNode(LifecycleNode):
                 self.log.error(str(error))
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
-            if not rclpy.utilities.ok():  # a signal has come meanwhile
-                return TransitionCallbackReturn.FAILURE
-            self.log.error(f"{error}\n{traceback.format_exc()}")
+            if rclpy.utilities.ok():  # else a signal has come meanwhile
+                self.log.error(f"{error}\n{traceback.format_exc()}")
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 
@@ -183,7 +177,7 @@ class ManagedNode(LifecycleNode):
         self._began = time.monotonic()
         self.released = not self._awaited()
         if not self.released:
-            self._look = self.create_timer(LOOK_PERIOD_S, self._release, clock=self._wall)
+            self._look = self.every(LOOK_PERIOD_S, self._release)
         self.on_start()
 
     # Topics.
@@ -255,6 +249,10 @@ class ManagedNode(LifecycleNode):
 
     # Time.
 
+    def every(self, period_s: float, call: Callable[[], None]) -> Any:
+        """Call again and again, in wall time; return the timer."""
+        return self.create_timer(period_s, call, clock=self._wall)
+
     def _on_jump(self, jump: Any) -> None:
         self.log.warning("The clock has jumped back: starting anew.")
         self.counted["clock_jumps"] += 1
@@ -287,67 +285,3 @@ class ManagedNode(LifecycleNode):
         self._diagnostics.publish(
             diagnostic_array(self.now_ns(), self.get_name(), level, "; ".join(warnings) or "ok", shown)
         )
-
-
-def run(make: Callable[[], ManagedNode]) -> int:
-    """Run a node until SIGINT, SIGTERM or its own end; return the exit code.
-
-    0: ended as asked; 1: a fault; 2: a parameter was wrong.
-    """
-    node = None
-    try:
-        rclpy.init()
-    except RCLError as error:  # a parameter file that cannot be read, a malformed argument
-        return _failed(str(error), 2)
-    executor = SingleThreadedExecutor()
-    try:
-        node = make()
-        executor.add_node(node)
-        while rclpy.utilities.ok() and not getattr(node, "finished", False):
-            executor.spin_once()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except ParameterError as error:
-        return _failed(str(error), 2)
-    except Exception as error:
-        # When a signal comes while the node is being built or waits, what it builds upon is gone; that is no fault.
-        if not _ending():
-            if not isinstance(error, Fault):
-                raise
-            return _failed(str(error), 1)
-    finally:
-        _close(node)
-    return 0
-
-
-def _ending() -> bool:
-    """Tell whether a signal is ending this process: its errors may be seen a little before the context says so."""
-    deadline = time.monotonic() + SIGNAL_LAG_S
-    while rclpy.utilities.ok() and time.monotonic() < deadline:
-        time.sleep(0.01)
-    return not rclpy.utilities.ok()
-
-
-def _failed(text: str, code: int) -> int:
-    print(text, file=sys.stderr)
-    return code
-
-
-def _close(node: ManagedNode | None) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ending already; a second Ctrl-C shall not lose the result
-    try:
-        if node is not None:
-            node.close()
-    finally:
-        rclpy.utilities.try_shutdown()
-
-
-def end(code: int) -> None:
-    """End the process with this code.
-
-    Destroying a node entity by entity while its context goes down can crash inside DDS; by now all is published and
-    written, so the process leaves without.
-    """
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)

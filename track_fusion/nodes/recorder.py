@@ -1,19 +1,26 @@
-"""Record topics to a rosbag2 directory, mcap or sqlite3, where `ros2 bag record` is not to be had."""
+"""Recording topics to a rosbag2 directory, mcap or sqlite3, where `ros2 bag record` is not to be had."""
 
 from __future__ import annotations
 
+import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import rclpy
+import rclpy.utilities
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
-from track_fusion.nodes.bag_player import message_class
-from track_fusion.nodes.managed import Fault, qos
+from track_fusion.nodes.managed import class_of, qos
+from track_fusion.params import Fault
 
 #: A recorder that falls behind by more messages of one topic than this loses some, and counts them.
 QUEUE = 1000
+#: How long to wait for a publisher that tells a topic's type.
+DISCOVERY_S = 10.0
 
 
 class Recorder:
@@ -48,7 +55,7 @@ class Recorder:
             raise Fault(f"{path} exists already; a bag is not overwritten.")
         self._node, self.counts = node, Counter[str]()
         self._early: deque[tuple[Any, bytes]] = deque()
-        classes = {kind: message_class(kind) for kind in topics.values()}
+        classes = {kind: class_of(kind) for kind in topics.values()}
         self._writer = Writer(path, version=9, storage_plugin=plugins[storage])
         self._writer.open()
         store = get_typestore(Stores.ROS2_JAZZY)
@@ -76,23 +83,46 @@ class Recorder:
         self._writer.close()
 
 
-def read_bag(path: Path, topics: tuple[str, ...]) -> dict[str, list[Any]]:
-    """Read all messages of some topics, deserialised, in the order of the bag.
+def record_until_told(out: Path, topics: Sequence[str], storage: str, sim_time: bool) -> dict[str, int]:
+    """Record in a process of its own until SIGINT or SIGTERM; return how many messages of each topic there were.
+
+    Parameters
+    ----------
+    out : Path                new directory of the bag
+    topics : sequence of str  NAME, or NAME:TYPE
+    storage : str             mcap or sqlite3
+    sim_time : bool           stamp with /clock
 
     Raises
     ------
-    Fault    there is no such bag, or the package rosbags is missing
+    Fault    a topic's type stays unknown, or recording is not possible
     """
-    from rclpy.serialization import deserialize_message
-
-    from track_fusion.nodes.bag_player import open_bag
-
-    reader = open_bag(str(path))
+    rclpy.init()
+    node = Node("recorder", parameter_overrides=[Parameter("use_sim_time", Parameter.Type.BOOL, sim_time)])
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    recorder = None
     try:
-        chosen = [c for c in reader.connections if c.topic in topics]
-        found: dict[str, list[Any]] = {topic: [] for topic in topics}
-        for connection, _, data in reader.messages(connections=chosen):
-            found[connection.topic].append(deserialize_message(bytes(data), message_class(connection.msgtype)))
-        return found
+        recorder = Recorder(node, out, _types(node, executor, topics), storage)
+        while rclpy.utilities.ok():
+            executor.spin_once()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
     finally:
-        reader.close()
+        if recorder is not None:
+            recorder.close()
+        rclpy.utilities.try_shutdown()
+    return dict(recorder.counts) if recorder else {}
+
+
+def _types(node: Node, executor: SingleThreadedExecutor, topics: Sequence[str]) -> dict[str, str]:
+    """Take each topic's type from its name or from its publisher."""
+    wanted = dict(t.partition(":")[::2] for t in topics)
+    deadline = time.monotonic() + DISCOVERY_S
+    while unknown := [t for t, kind in wanted.items() if not kind]:
+        known = dict(node.get_topic_names_and_types())
+        wanted |= {t: known[t][0] for t in unknown if known.get(t)}
+        if time.monotonic() > deadline:
+            raise Fault(f"Nobody publishes {unknown[0]}; give its type: {unknown[0]}:sensor_msgs/msg/PointCloud2.")
+        executor.spin_once(timeout_sec=0.05)
+    return wanted

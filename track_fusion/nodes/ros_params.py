@@ -92,8 +92,3 @@ def refuse_unknown(node: Node) -> None:
     for name in node._parameter_overrides:
         if name not in valid and name not in _BUILT_IN and not name.startswith(_BUILT_IN_PREFIX):
             raise unknown_name_error(name, valid)
-
-
-def shown(params: Params) -> dict[str, Any]:
-    """Name and value of each parameter, for a log line."""
-    return {name: getattr(params, name) for name in specs(params)}

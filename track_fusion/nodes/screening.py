@@ -43,8 +43,7 @@ def screened_tracks(node: ManagedNode, arrays: TrackArrays, layout: StateLayout)
     """
     if arrays.phd:
         raise MessageError("phd_mixture", "The rows are un-normalised (PHD) mixtures; this node takes one target each.")
-    fields = {name: value for name, value in vars(arrays).items() if name != "axes"}
-    batch, rejected = TrackBatch.screened(layout=StateLayout(arrays.axes), **fields)
+    batch, rejected = TrackBatch.screened(layout=StateLayout(arrays.axes), **arrays.columns)
     if rejected:
         ids = sorted(set(arrays.track_id.tolist()) - set(batch.track_id.tolist()))[:5]
         node.reject(rejected, f"in a scan of {len(arrays.track_id)} tracks, track {', '.join(map(str, ids))}")
@@ -73,7 +72,10 @@ def _bad_detections(scan: DetectionArrays) -> dict[str, NDArray[np.bool_]]:
     finite = np.asarray(np.isfinite(scan.value).all(1))
     size = np.zeros(len(finite)) if scan.cov is None else np.sqrt(np.abs(scan.cov).max((1, 2), initial=0.0))
     finite &= np.isfinite(size)
-    found = {"not_finite": ~finite, "absurd_value": (np.abs(scan.value).max(1, initial=0.0) > ABSURD) | (size > ABSURD)}
+    reasons = {
+        "not_finite": ~finite,
+        "absurd_value": (np.abs(scan.value).max(1, initial=0.0) > ABSURD) | (size > ABSURD),
+    }
     if "range" in scan.axes:
-        found["negative_range"] = scan.value[:, scan.axes.index("range")] < 0.0
-    return found
+        reasons["negative_range"] = scan.value[:, scan.axes.index("range")] < 0.0
+    return reasons

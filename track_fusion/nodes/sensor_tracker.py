@@ -16,11 +16,12 @@ from msg_adapters.odometry import odometry_to_msgs
 from msg_adapters.track_table import track_table_from_msg, track_table_to_msg
 from track_fusion.models.choices import MOTIONS, SENSORS
 from track_fusion.models.measurement import RangeBearingSensor
-from track_fusion.nodes.managed import ManagedNode, end, run
+from track_fusion.nodes.managed import ManagedNode
+from track_fusion.nodes.process import end, run
 from track_fusion.nodes.ros_params import chosen, declare
 from track_fusion.nodes.screening import FrameParams, screened_detections, screened_tracks
 from track_fusion.params import ParameterError, Params, param
-from track_fusion.trackers.filters import TRACK_FILTERS
+from track_fusion.trackers.filters import FILTERS
 from track_fusion.trackers.many_targets import PdaTracker, PdaTrackerParams
 from track_fusion.trackers.one_target import (
     MULTI_TARGET,
@@ -77,7 +78,7 @@ class SensorTrackerNode(ManagedNode):
         motion = chosen(self, MOTIONS, choice.motion, StateLayout(self.frame.axes))
         sensor = chosen(self, SENSORS, choice.sensor, motion.layout)
         if choice.filter != MULTI_TARGET:
-            track_filter = chosen(self, TRACK_FILTERS, choice.filter, motion, sensor)
+            track_filter = chosen(self, FILTERS, choice.filter, motion, sensor)
             params = declare(self, SensorTrackerParams)
             return SensorTracker(motion, sensor, track_filter, self.frame.frame_id, params)
         if not isinstance(sensor, RangeBearingSensor):

@@ -19,13 +19,19 @@ LEGEND_INSIDE = 5
 LABEL_OF_HALF_WIDTH = 34
 
 
-def svg(chart: Chart) -> str:
-    """Return a chart as an SVG document; equal charts give equal text."""
+def pyplot() -> Any:
+    """Import matplotlib only when something is drawn, and without a display."""
     import matplotlib
 
     matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
+    from matplotlib import pyplot
 
+    return pyplot
+
+
+def svg(chart: Chart) -> str:
+    """Return a chart as an SVG document; equal charts give equal text."""
+    plt = pyplot()
     with plt.rc_context({"svg.hashsalt": "track_fusion", "svg.fonttype": "none", "font.size": 11}):
         figure, axes = plt.subplots(figsize=(WIDTH, HEIGHT), layout="constrained")
         try:

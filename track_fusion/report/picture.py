@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from track_fusion.linalg import Array
+from track_fusion.report.drawing import pyplot
 
 #: Ellipses are drawn at this many standard deviations.
 SIGMAS = 2.0
@@ -29,7 +30,7 @@ class Line:
     cov: Array | None = None
 
 
-def draw(path: Path, title: str, truth: Line, tracks: Sequence[Line], errors: str = "position error") -> None:
+def draw(path: Path, title: str, truth: Line, tracks: Sequence[Line]) -> None:
     """Draw the whole course, a close-up of its end, and each track's position error over time, as PNG.
 
     Parameters
@@ -38,43 +39,34 @@ def draw(path: Path, title: str, truth: Line, tracks: Sequence[Line], errors: st
     title : str
     truth : Line               cov None
     tracks : sequence of Line  the same T steps; the last is drawn on top with its ellipses
-    errors : str               title of the error panel
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, (course, close, error) = plt.subplots(1, 3, figsize=(16, 5.2), constrained_layout=True)
+    figure, (course, close, error) = pyplot().subplots(1, 3, figsize=(16, 5.2), constrained_layout=True)
     figure.suptitle(title)
-    flat = truth.position.shape[1] == 1
-    for axes, start in ((course, 0), (close, max(0, len(truth.position) - CLOSE_UP))):
-        axes.plot(*_course(truth, start), color=truth.color, lw=2.0, label=truth.label)
-        for line in tracks:
-            axes.plot(*_course(line, start), ".-", ms=3, lw=0.9, color=line.color, label=line.label)
-        if flat:
-            axes.set(xlabel="step", ylabel="x / m")
-            continue
-        if start:
-            for line in tracks:
-                _ellipses(axes, line, start)
-        axes.set_aspect("equal", "datalim")
-        axes.set_xlabel("x / m")
-        axes.set_ylabel("y / m")
+    _draw_course(course, truth, tracks, 0)
+    _draw_course(close, truth, tracks, max(0, len(truth.position) - CLOSE_UP))
     course.legend(loc="best", fontsize=9)
     course.set_title("course")
-    ellipses = "" if flat else f", {SIGMAS:g}-sigma ellipses every {ELLIPSE_EVERY}"
+    ellipses = f", {SIGMAS:g}-sigma ellipses every {ELLIPSE_EVERY}" if truth.position.shape[1] > 1 else ""
     close.set_title(f"last {CLOSE_UP} steps{ellipses}")
     for line in tracks:
         error.plot(np.linalg.norm(line.position - truth.position, axis=1), color=line.color, label=line.label)
-    error.set_title(errors)
-    error.set_xlabel("step")
-    error.set_ylabel("m")
+    error.set(title="position error", xlabel="step", ylabel="m")
     error.set_ylim(bottom=0)
-    for axes in (course, close, error):
-        axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    _save(path, figure, (course, close, error))
+
+
+def _draw_course(axes: Any, truth: Line, tracks: Sequence[Line], start: int) -> None:
+    """Draw from a step on, with ellipses unless that is the first."""
+    axes.plot(*_course(truth, start), color=truth.color, lw=2.0, label=truth.label)
+    for line in tracks:
+        axes.plot(*_course(line, start), ".-", ms=3, lw=0.9, color=line.color, label=line.label)
+    if truth.position.shape[1] == 1:
+        axes.set(xlabel="step", ylabel="x / m")
+        return
+    for line in tracks if start else ():
+        _ellipses(axes, line, start)
+    axes.set_aspect("equal", "datalim")
+    axes.set(xlabel="x / m", ylabel="y / m")
 
 
 def _course(line: Line, start: int) -> tuple[Array, Array]:
@@ -87,21 +79,21 @@ def _course(line: Line, start: int) -> tuple[Array, Array]:
 
 def draw_map(path: Path, title: str, lines: Sequence[Line]) -> None:
     """Draw the positions of many targets in one plane as PNG: the first is the truth, each a set of points."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(10, 9), constrained_layout=True)
+    figure, axes = pyplot().subplots(figsize=(10, 9), constrained_layout=True)
     for order, line in enumerate(lines):
         size, (x, y) = 1.0 if line.cov is None else 9.0 / order, line.position.T / 1e3
         axes.scatter(x, y, s=size, color=line.color, label=line.label, linewidths=0)
     axes.set_aspect("equal", "datalim")
     axes.set(title=title, xlabel="x / km", ylabel="y / km")
     axes.legend(loc="best", markerscale=3)
-    axes.grid(alpha=0.3)
+    _save(path, figure, (axes,))
+
+
+def _save(path: Path, figure: Any, panels: Sequence[Any]) -> None:
+    for axes in panels:
+        axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
-    plt.close(figure)
+    pyplot().close(figure)
 
 
 def _ellipses(axes: Any, line: Line, start: int) -> None:

@@ -7,18 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from track_fusion.densities.gaussian import merge, merge_near
+from track_fusion.densities.gaussian import merge_near
 from track_fusion.densities.mixture.algebra import average
-from track_fusion.linalg import Array
-from track_fusion.params import Params, param
-from track_fusion.rules.base import FusedTracks, Mixture, Rule, SourceTracks, check_weights
+from track_fusion.linalg import Array, merged_moments
+from track_fusion.params import param
+from track_fusion.rules.base import Example, FusedTracks, Mixture, Rule, SourceTracks
+from track_fusion.rules.shared.weights import GIVEN, UNIFORM, WeightParams, diagnostics
 from track_fusion.solvers.optimise import Solution
 from track_fusion.weights.bound import bound_weights
 from track_fusion.weights.merging import merging_weights
 
 
 @dataclasses.dataclass(frozen=True)
-class ArithmeticAverageParams(Params):
+class ArithmeticAverageParams(WeightParams):
     """How the fusion weights are chosen and what is handed on."""
 
     criterion: str = param(
@@ -27,9 +28,6 @@ class ArithmeticAverageParams(Params):
         "target density, eq. (39), in proportion to the likelihood of each track's measurements, uniform, or given by "
         "'weights'",
         choices=("diversity", "bound", "target", "likelihood", "uniform", "given"),
-    )
-    weights: tuple[float, ...] = param(
-        (), "fusion weights for criterion given, one a source, sum 1", low=0.0, high=1.0, kind=float
     )
     output: str = param(
         "merged",
@@ -72,27 +70,28 @@ def fuse(tracks: SourceTracks, params: ArithmeticAverageParams) -> FusedTracks:
     References     T. Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average
                    Density Fusion, eqs. (6), (10)-(11), (37), (39), (40), (45), section II-E.
     """
-    batch, count = tracks.mean.shape[:-2], tracks.count
-    info: dict[str, Any] = {}
-    if params.weights and params.criterion != "given":
-        raise ValueError(f"The 'weights' parameter needs criterion 'given'. Got criterion {params.criterion!r}.")
-    if params.criterion == "given":
-        weights = np.broadcast_to(check_weights(params.weights, count), (*batch, count))
-    elif params.criterion == "likelihood":
-        weights = _by_likelihood(tracks)
-    elif params.criterion == "uniform" or count == 1:
-        weights = np.full((*batch, count), 1.0 / count)
-    else:
-        found = _sought(tracks, params.criterion)
-        weights = found.weights.reshape(*batch, count)
-        info = {"converged": found.converged.reshape(batch), "iterations": found.iterations.reshape(batch)}
-    mean, cov = merge(tracks.mean, tracks.cov, weights)
+    weights, info = _weights(tracks, params)
+    mean, cov = merged_moments(tracks.mean, tracks.cov, weights)
     mixture = None
     if params.output == "mixture":
         mixture = _mixture(tracks, weights)
         if params.merge_threshold > 0:
             mixture = Mixture(*merge_near(mixture.weight, mixture.mean, mixture.cov, params.merge_threshold))
     return FusedTracks(mean, cov, weights, mixture=mixture, info=info)
+
+
+def _weights(tracks: SourceTracks, params: ArithmeticAverageParams) -> tuple[Array, dict[str, Any]]:
+    """Weights (..., K) by the criterion, and how their search went."""
+    weights = params.fixed(tracks)
+    if params.criterion == "likelihood":
+        weights = _by_likelihood(tracks)
+    elif weights is None and tracks.count == 1:
+        weights = np.ones(tracks.mean.shape[:-1])
+    if weights is not None:
+        return weights, {}
+    search = _sought(tracks, params.criterion)
+    info = {name: values.reshape(tracks.batch) for name, values in diagnostics(search).items()}
+    return search.weights.reshape(tracks.mean.shape[:-1]), info
 
 
 def _mixture(tracks: SourceTracks, weights: Array) -> Mixture:
@@ -104,17 +103,17 @@ def _mixture(tracks: SourceTracks, weights: Array) -> Mixture:
 
 def _sought(tracks: SourceTracks, criterion: str) -> Solution:
     """Find the weights of a program, of a flat batch."""
-    count, n = tracks.mean.shape[-2:]
-    mean, cov = tracks.mean.reshape(-1, count, n), tracks.cov.reshape(-1, count, n, n)
+    mean, cov = tracks.flat
     if criterion == "bound":
         return bound_weights(mean, cov)
-    return merging_weights(mean, cov, None if criterion == "diversity" else _target_slopes(tracks).reshape(-1, count))
+    slopes = None if criterion == "diversity" else _target_slopes(tracks).reshape(mean.shape[:2])
+    return merging_weights(mean, cov, slopes)
 
 
 def _target_slopes(tracks: SourceTracks) -> Array:
     """Linear part of (39), (..., K): tr(P^-1 (P_i + (x_i - x)(x_i - x)')) for a target of moments x, P."""
     target: Mixture = tracks.extras["target"]
-    mean, cov = merge(target.mean, target.cov, target.weight / target.weight.sum(-1, keepdims=True))
+    mean, cov = merged_moments(target.mean, target.cov, target.weight / target.weight.sum(-1, keepdims=True))
     offset = tracks.mean - mean[..., None, :]
     second = tracks.cov + offset[..., :, None] * offset[..., None, :]
     slopes = np.trace(np.linalg.solve(cov[..., None, :, :], second), axis1=-2, axis2=-1)
@@ -135,6 +134,11 @@ def _by_likelihood(tracks: SourceTracks) -> Array:
     return np.asarray(share / share.sum(-1, keepdims=True))
 
 
+EXAMPLES = (
+    {**UNIFORM, "output": "mixture"}, GIVEN, {"criterion": "bound"}, {"criterion": "target"},
+    {"criterion": "likelihood"}, {"output": "mixture", "merge_threshold": 1.5},
+)  # fmt: skip
+
 RULE = Rule(
     key="arithmetic_average",
     title="Arithmetic average",
@@ -148,4 +152,5 @@ RULE = Rule(
     cost="K n^3, about ten times that for weights that are sought with K > 2",
     needs_when=(("target", "criterion", "target"), ("likelihood", "criterion", "likelihood")),
     takes_particles=True,
+    example=Example(({}, *EXAMPLES), (UNIFORM, GIVEN), idempotent=True),
 )

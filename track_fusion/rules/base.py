@@ -7,8 +7,10 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from track_fusion.densities.mixture.mixture import Mixture as Mixture
+from track_fusion.densities.mixture.mixture import gaussian, moments
 from track_fusion.linalg import Array, asymmetric, is_positive_definite, symmetrise
 from track_fusion.params import Params
 
@@ -39,10 +41,26 @@ class SourceTracks:
     mixture: Mixture | None = None
     extras: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
+    @classmethod
+    def of(cls, densities: Mixture, **extras: Any) -> SourceTracks:
+        """Make tracks of K mixtures (..., K, C); those of one component are Gaussian tracks."""
+        return cls(*moments(densities), mixture=densities if densities.count > 1 else None, extras=extras)
+
     @property
     def count(self) -> int:
         """Number of sources K."""
         return int(self.mean.shape[-2])
+
+    @property
+    def batch(self) -> tuple[int, ...]:
+        """The leading axes."""
+        return self.mean.shape[:-2]
+
+    @property
+    def flat(self) -> tuple[Array, Array]:
+        """Mean (B, K, n) and cov (B, K, n, n), the leading axes as one."""
+        tail = self.cov.shape[-3:]
+        return self.mean.reshape(-1, *tail[:2]), self.cov.reshape(-1, *tail)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +81,44 @@ class FusedTracks:
     dof: Array | None = None
     mixture: Mixture | None = None
     info: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def density(self) -> Mixture:
+        """The fused mixture, or the Gaussian of the moments, of one component."""
+        return gaussian(self.mean, self.cov) if self.mixture is None else self.mixture
+
+    def shaped(self, batch: tuple[int, ...]) -> FusedTracks:
+        """Give the arrays of a flat batch (B, ...) their leading axes back."""
+
+        def shape(array: NDArray[Any]) -> NDArray[Any]:
+            return array.reshape((*batch, *array.shape[1:]))
+
+        info = {name: shape(array) for name, array in self.info.items()}
+        weights, dof = (None if array is None else shape(array) for array in (self.weights, self.dof))
+        mixture = self.mixture and Mixture(*map(shape, vars(self.mixture).values()))
+        return FusedTracks(shape(self.mean), shape(self.cov), weights, dof, mixture, info)
+
+
+Values = Mapping[str, Any]
+#: Stands in an example for one weight a source, unequal and of sum 1.
+EACH: Any = ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Example:
+    """What the laws of `contract` need to know beyond the descriptor: at which parameters a rule is tried, and how."""
+
+    params: tuple[Values, ...] = ({},)
+    guaranteed: tuple[Values, ...] = ({},)  # where the guarantee holds
+    not_equivariant: tuple[Values, ...] = ()  # where the result depends on axes and units, if the claim is a text
+    idempotent: bool | None = None  # whether copies of one track fuse to that track; None: not stated
+    #: by how many standard deviations moments may vary with the random numbers, if every sample is effective; where
+    #: parameters name a number of samples
+    monte_carlo: float = 0.0
+    #: tracks -> extras that the rule needs and that `contract.EXTRAS` does not know; they must move with the tracks
+    extras: Callable[[SourceTracks], Mapping[str, Any]] | None = None
+    #: for guarantee none or structural: the true error variance over the claimed one, measured and as stated
+    counter_example: Callable[[], tuple[float, float]] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +145,7 @@ class Rule:
     affine_equivariant: bool | str = True  # a string says why not, or under which parameters
     takes_particles: bool = False  # components without covariance; the fusion centre gives other rules their Gaussian
     linear: bool = False  # the fused mean is linear in the means; all else depends on the covariances alone
+    example: Example = Example()
 
     def __call__(self, tracks: SourceTracks, params: Params | None = None) -> FusedTracks:
         """Check the tracks, then fuse them; `fuse` alone trusts them, for callers that screened them before.
@@ -112,21 +169,6 @@ class Rule:
     def needed(self, params: Params) -> tuple[str, ...]:
         """Names of the extras without which the rule cannot do at these parameters."""
         return (*self.needs, *(name for name, key, value in self.needs_when if getattr(params, key) == value))
-
-
-def check_weights(weights: tuple[float, ...], count: int, total: float = 1.0) -> Array:
-    """Return given fusion weights as an array, or say what is wrong with them.
-
-    Raises
-    ------
-    ValueError    not one weight a source, a negative one, or a sum other than `total`
-    """
-    array = np.asarray(weights, float)
-    if array.shape != (count,):
-        raise ValueError(f"The 'weights' parameter must hold one weight a source, {count}. Got {len(weights)}.")
-    if (array < 0).any() or abs(array.sum() - total) > 1e-9:
-        raise ValueError(f"The 'weights' parameter must be non-negative and sum to {total:g}. Got {weights}.")
-    return array
 
 
 def check_tracks(tracks: SourceTracks) -> None:

@@ -7,10 +7,11 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.gaussian import keep_sole, weighted_product
-from track_fusion.linalg import Array, inverse, matvec, outer, symmetrise, transpose
-from track_fusion.params import Params, param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
+from track_fusion.densities.gaussian import weighted_product
+from track_fusion.linalg import Array, inverse, keep_sole, matvec, outer, symmetrise, transpose
+from track_fusion.params import param
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks, Values
+from track_fusion.rules.shared.weights import GIVEN, TRACE, UNIFORM, WeightParams, diagnostics, pooled
 from track_fusion.solvers.optimise import (
     Derivatives,
     ScalarDerivatives,
@@ -26,7 +27,7 @@ PAIR_CHUNK, MANY_CHUNK = 1024, 512
 
 
 @dataclasses.dataclass(frozen=True)
-class CovarianceIntersectionParams(Params):
+class CovarianceIntersectionParams(WeightParams):
     """How the fusion weights omega are chosen."""
 
     criterion: str = param(
@@ -34,9 +35,6 @@ class CovarianceIntersectionParams(Params):
         "what the weights minimise: the fused determinant (does not depend on units), the fused trace "
         "(does), nothing (uniform), or nothing (given by 'weights')",
         choices=("det", "trace", "uniform", "given"),
-    )
-    weights: tuple[float, ...] = param(
-        (), "fusion weights for criterion given, one a source, sum 1", low=0.0, high=1.0, kind=float
     )
 
 
@@ -65,21 +63,13 @@ def fuse(tracks: SourceTracks, params: CovarianceIntersectionParams) -> FusedTra
     References     T. Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average
                    Density Fusion, eqs. (16)-(18).
     """
-    batch, (count, n) = tracks.mean.shape[:-2], tracks.mean.shape[-2:]
-    if params.criterion == "given" or params.weights:
-        if params.criterion != "given":
-            raise ValueError(f"The 'weights' parameter needs criterion 'given'. Got criterion {params.criterion!r}.")
-        weights = np.broadcast_to(check_weights(params.weights, count), (*batch, count))
-        return FusedTracks(*weighted_product(tracks.mean, tracks.cov, weights), weights)
-    if params.criterion == "uniform" or count == 1:
-        weights = np.full((*batch, count), 1.0 / count)
-        return FusedTracks(*weighted_product(tracks.mean, tracks.cov, weights), weights)
-    mean, cov, found = _optimal(
-        tracks.mean.reshape(-1, count, n), tracks.cov.reshape(-1, count, n, n), params.criterion
-    )
-    info = {"converged": found.converged.reshape(batch), "iterations": found.iterations.reshape(batch)}
-    weights = found.weights.reshape(*batch, count)
-    return FusedTracks(mean.reshape(*batch, n), cov.reshape(*batch, n, n), weights, info=info)
+    weights = params.fixed(tracks)
+    if weights is None and tracks.count == 1:
+        weights = np.ones(tracks.mean.shape[:-1])
+    if weights is not None:
+        return pooled(tracks, weights)
+    mean, cov, search = _optimal(*tracks.flat, params.criterion)
+    return FusedTracks(mean, cov, search.weights, info=diagnostics(search)).shaped(tracks.batch)
 
 
 Fusion = tuple[Array, Array, Solution]
@@ -270,6 +260,8 @@ def _trace(a: Array) -> Array:
     return np.asarray(np.trace(a, axis1=-2, axis2=-1))
 
 
+EXAMPLES: tuple[Values, ...] = ({}, TRACE, UNIFORM, GIVEN)
+
 RULE = Rule(
     key="covariance_intersection",
     title="Covariance intersection",
@@ -283,4 +275,5 @@ RULE = Rule(
     cost="K n^3, about ten times that for K > 2",
     linear=True,
     affine_equivariant="not with criterion trace: the trace depends on the units of the axes",
+    example=Example(EXAMPLES, EXAMPLES, (TRACE,), idempotent=True),
 )

@@ -7,10 +7,11 @@ from typing import Literal, cast
 
 import numpy as np
 
-from track_fusion.linalg import Array, outer
+from track_fusion.linalg import outer
 from track_fusion.params import Params, param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
-from track_fusion.solvers.upper_bound import Bound, bound_about, bound_anywhere
+from track_fusion.rules.base import EACH, Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.weights import TRACE, check_weights, diagnostics
+from track_fusion.solvers.upper_bound import bound_about, bound_anywhere
 from track_fusion.weights.merging import merging_weights
 
 
@@ -69,37 +70,32 @@ def fuse(tracks: SourceTracks, params: CovarianceUnionParams) -> FusedTracks:
     References     T. Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average
                    Density Fusion, eqs. (7)-(9).
     """
-    batch, (count, n) = tracks.mean.shape[:-2], tracks.mean.shape[-2:]
-    means, covs = tracks.mean.reshape(-1, count, n), tracks.cov.reshape(-1, count, n, n)
+    means, covs = tracks.flat
     criterion = cast(Literal["det", "trace"], params.criterion)
     if params.weights and params.mean != "arithmetic":
         raise ValueError(f"The 'weights' parameter needs mean 'arithmetic'. Got mean {params.mean!r}.")
     if params.mean == "optimal":
         if params.bound != "optimal":
             raise ValueError(f"The 'mean' parameter 'optimal' needs bound 'optimal'. Got bound {params.bound!r}.")
-        return _shaped(bound_anywhere(means, covs, criterion), batch, None)
+        best = bound_anywhere(means, covs, criterion)
+        return FusedTracks(best.mean, best.cov, info=diagnostics(best)).shaped(tracks.batch)
     if params.mean == "diversity":
         share = merging_weights(means, covs).weights
     else:
-        equal = np.full(count, 1.0 / count)
-        share = np.broadcast_to(check_weights(params.weights, count) if params.weights else equal, means.shape[:2])
+        given = params.weights or (1.0 / tracks.count,) * tracks.count
+        share = np.broadcast_to(check_weights(given, tracks.count), means.shape[:2])
     origin = means[:, 0]
     mean = origin + (share[..., None] * (means - origin[:, None])).sum(1)
-    weights = share.reshape(*batch, count)
     if params.bound == "optimal":
-        return _shaped(bound_about(mean, means, covs, criterion), batch, weights)
+        best = bound_about(mean, means, covs, criterion)
+        return FusedTracks(best.mean, best.cov, share, info=diagnostics(best)).shaped(tracks.batch)
     sides = covs + outer(mean[:, None] - means)
     traces = np.trace(sides, axis1=-2, axis2=-1)
     chosen = traces.argmax(1) if params.bound == "max_trace" else traces.argmin(1)
-    cov = sides[np.arange(len(sides)), chosen]
-    return FusedTracks(mean.reshape(*batch, n), cov.reshape(*batch, n, n), weights)
+    return FusedTracks(mean, sides[np.arange(len(sides)), chosen], share).shaped(tracks.batch)
 
 
-def _shaped(found: Bound, batch: tuple[int, ...], weights: Array | None) -> FusedTracks:
-    n = found.mean.shape[-1]
-    info = {"converged": found.converged.reshape(batch), "iterations": found.iterations.reshape(batch)}
-    return FusedTracks(found.mean.reshape(*batch, n), found.cov.reshape(*batch, n, n), weights, info=info)
-
+UNEQUAL = (TRACE, {**TRACE, "mean": "optimal"}, {"bound": "max_trace"}, {"bound": "min_trace"})
 
 RULE = Rule(
     key="covariance_union",
@@ -113,4 +109,10 @@ RULE = Rule(
     source="Li 2022 (7)-(9)",
     cost="n^3 for K = 2, else some twelve times K n^6",
     affine_equivariant="not with a trace, whether as criterion or as bound: it depends on the units of the axes",
+    example=Example(
+        ({}, {"weights": EACH}, {"mean": "diversity"}, {"mean": "optimal"}, *UNEQUAL),
+        ({}, TRACE),
+        UNEQUAL,
+        idempotent=True,
+    ),
 )

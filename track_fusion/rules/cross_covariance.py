@@ -8,7 +8,7 @@ import numpy as np
 
 from track_fusion.linalg import Array, is_positive_definite, matvec, symmetrise, transpose
 from track_fusion.params import Params, param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
 
 #: An eigenvalue of the joint correlation may be so far below zero by rounding.
 ROUNDING = 1e-9
@@ -23,7 +23,7 @@ class CrossCovarianceParams(Params):
     method: str = param(
         "correlation",
         "correlation: assume the coefficient 'correlation' between any two tracks; given: take the cross-covariances "
-        "that come with the tracks (filters.cross_covariance computes them from the local Kalman gains)",
+        "that come with the tracks (Bar-Shalom's recursion has them from the local Kalman gains)",
         choices=("correlation", "given"),
     )
     correlation: float = param(
@@ -59,10 +59,9 @@ def fuse(tracks: SourceTracks, params: CrossCovarianceParams) -> FusedTracks:
                    covariance, 1986; N. Sharma et al., Harmonic Mean Density Fusion in Distributed Tracking:
                    Performance and Comparison, section 1.
     """
-    batch, (count, n) = tracks.mean.shape[:-2], tracks.mean.shape[-2:]
-    mean, cov = tracks.mean.reshape(-1, count, n), tracks.cov.reshape(-1, count, n, n)
+    (mean, cov), (count, n) = tracks.flat, tracks.mean.shape[-2:]
     if count == 1:
-        return FusedTracks(tracks.mean[..., 0, :].copy(), tracks.cov[..., 0, :, :].copy())
+        return FusedTracks(mean[:, 0].copy(), cov[:, 0].copy()).shaped(tracks.batch)
     lower = np.linalg.cholesky(cov.sum(1))
     whiten = np.linalg.inv(lower)[:, None]
     own = symmetrise(whiten @ cov @ transpose(whiten))
@@ -79,7 +78,7 @@ def fuse(tracks: SourceTracks, params: CrossCovarianceParams) -> FusedTracks:
     shift = matvec(weight, matvec(whiten, mean - mean[:, :1])).sum(1)
     fused_mean = mean[:, 0] + matvec(lower, shift)
     fused_cov = symmetrise(lower @ fused @ transpose(lower))
-    return FusedTracks(fused_mean.reshape(*batch, n), fused_cov.reshape(*batch, n, n))
+    return FusedTracks(fused_mean, fused_cov).shaped(tracks.batch)
 
 
 def _cross_cov(tracks: SourceTracks) -> Array:
@@ -134,4 +133,5 @@ RULE = Rule(
     source="Sharma 1 (Bar-Shalom and Campo)",
     cost="K^3 n^3",
     needs_when=(("cross_cov", "method", "given"),),
+    example=Example(({}, {"method": "given"}), ({"method": "given"},), idempotent=False),
 )

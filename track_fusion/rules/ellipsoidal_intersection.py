@@ -8,8 +8,8 @@ import numpy as np
 
 from track_fusion.linalg import Array
 from track_fusion.params import Params
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.pairwise import PairFusion, fold
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.folding import PairFusion, fold
 from track_fusion.solvers.pair import Pair
 
 
@@ -69,4 +69,5 @@ RULE = Rule(
     cost="K n^3",
     order_matters=True,
     linear=True,
+    example=Example(idempotent=True),
 )

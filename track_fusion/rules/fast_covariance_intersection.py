@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from track_fusion.densities.gaussian import weighted_product
 from track_fusion.params import Params
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.weights import pooled_by
 from track_fusion.weights.pooling import chernoff_weights
 
 
@@ -42,11 +42,7 @@ def fuse(tracks: SourceTracks, params: FastCovarianceIntersectionParams) -> Fuse
                    (FCI); N. R. Ahmed, Decentralized Gaussian Mixture Fusion through Unified Quotient
                    Approximations, eqs. (9)-(10).
     """
-    batch, (count, n) = tracks.mean.shape[:-2], tracks.mean.shape[-2:]
-    found = chernoff_weights(tracks.mean.reshape(-1, count, n), tracks.cov.reshape(-1, count, n, n))
-    weights = found.weights.reshape(*batch, count)
-    info = {"converged": found.converged.reshape(batch), "iterations": found.iterations.reshape(batch)}
-    return FusedTracks(*weighted_product(tracks.mean, tracks.cov, weights), weights, info=info)
+    return pooled_by(chernoff_weights, tracks)
 
 
 RULE = Rule(
@@ -60,4 +56,5 @@ RULE = Rule(
     caveat="the weights depend on the means: errors a few percent above the claim are possible",
     source="Chen 2022; Ahmed (9)-(10)",
     cost="K n^3, about ten times that for K > 2",
+    example=Example(idempotent=True),
 )

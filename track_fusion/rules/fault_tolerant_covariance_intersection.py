@@ -6,7 +6,8 @@ import dataclasses
 
 from track_fusion.params import param
 from track_fusion.rules import covariance_intersection
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.weights import GIVEN, TRACE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +51,8 @@ def fuse(tracks: SourceTracks, params: FaultTolerantCovarianceIntersectionParams
     return dataclasses.replace(fused, cov=fused.cov / params.delta, weights=fused.weights * params.delta)
 
 
+HALVED = {**TRACE, "delta": 0.5}
+
 RULE = Rule(
     key="fault_tolerant_covariance_intersection",
     title="Fault-tolerant covariance intersection",
@@ -62,4 +65,5 @@ RULE = Rule(
     source="Li 2022 II-C",
     cost="as covariance intersection",
     affine_equivariant="not with criterion trace: the trace depends on the units of the axes",
+    example=Example(({}, HALVED, GIVEN), ({}, GIVEN), (HALVED,), idempotent=False),
 )

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 
-import numpy as np
-
-from track_fusion.densities.gaussian import weighted_product
-from track_fusion.params import Params, param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
+from track_fusion.params import param
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.weights import GIVEN, WeightParams, pooled, pooled_by
 from track_fusion.weights.pooling import chernoff_weights, minimax_weights
 
 
 @dataclasses.dataclass(frozen=True)
-class GeometricAverageParams(Params):
+class GeometricAverageParams(WeightParams):
     """How the fusion weights omega are chosen."""
 
     criterion: str = param(
@@ -21,9 +19,6 @@ class GeometricAverageParams(Params):
         "fusion weights: uniform (the average of least mean divergence), chernoff (as far from every track), "
         "minimax_information_loss (nearest to the naive product), or given by 'weights'",
         choices=("uniform", "chernoff", "minimax_information_loss", "given"),
-    )
-    weights: tuple[float, ...] = param(
-        (), "fusion weights for criterion given, one a source, sum 1", low=0.0, high=1.0, kind=float
     )
 
 
@@ -54,19 +49,13 @@ def fuse(tracks: SourceTracks, params: GeometricAverageParams) -> FusedTracks:
                    Density Fusion, eqs. (15)-(17); N. R. Ahmed, Decentralized Gaussian Mixture Fusion through
                    Unified Quotient Approximations, eqs. (9)-(11).
     """
-    batch, (count, n) = tracks.mean.shape[:-2], tracks.mean.shape[-2:]
-    if params.weights and params.criterion != "given":
-        raise ValueError(f"The 'weights' parameter needs criterion 'given'. Got criterion {params.criterion!r}.")
-    if params.criterion in ("uniform", "given"):
-        share = check_weights(params.weights, count) if params.criterion == "given" else np.full(count, 1.0 / count)
-        weights = np.broadcast_to(share, (*batch, count))
-        return FusedTracks(*weighted_product(tracks.mean, tracks.cov, weights), weights)
-    find = chernoff_weights if params.criterion == "chernoff" else minimax_weights
-    found = find(tracks.mean.reshape(-1, count, n), tracks.cov.reshape(-1, count, n, n))
-    weights = found.weights.reshape(*batch, count)
-    info = {"converged": found.converged.reshape(batch), "iterations": found.iterations.reshape(batch)}
-    return FusedTracks(*weighted_product(tracks.mean, tracks.cov, weights), weights, info=info)
+    weights = params.fixed(tracks)
+    if weights is not None:
+        return pooled(tracks, weights)
+    return pooled_by(chernoff_weights if params.criterion == "chernoff" else minimax_weights, tracks)
 
+
+SOUGHT = ({"criterion": "chernoff"}, {"criterion": "minimax_information_loss"})
 
 RULE = Rule(
     key="geometric_average",
@@ -79,4 +68,7 @@ RULE = Rule(
     caveat="at weights that do not depend on the means (uniform, given), if every track is",
     source="Li 2022 (15)-(17); Ahmed (9)-(11)",
     cost="K n^3, about ten times that for weights that are sought",
+    example=Example(
+        ({}, {"criterion": "chernoff"}, {"criterion": "minimax_information_loss"}, GIVEN), ({}, GIVEN), idempotent=True
+    ),
 )

@@ -5,34 +5,23 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.mean_density import fit_mean_density, sample_mean_density
-from track_fusion.densities.mixture.mixture import chosen
+from track_fusion.densities.mixture.algebra import LogMixture, product
+from track_fusion.densities.mixture.mean_density import fit_mean_density, sample_mean_density
+from track_fusion.densities.mixture.mixture import Mixture, chosen, same
 from track_fusion.params import param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.mixture_common import (
-    Generators,
-    ReductionParams,
-    all_same,
-    average_weights,
-    fuse_sampled,
-    fused_tracks,
-    naive_product,
-    nth,
-)
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.mixtures import AverageParams, ReductionParams, fused_tracks, nth
+from track_fusion.rules.shared.sampling import Generators, fuse_sampled
+from track_fusion.rules.shared.weights import GIVEN
 
 
 @dataclasses.dataclass(frozen=True)
-class GeometricMeanSamplingParams(ReductionParams):
+class GeometricMeanSamplingParams(AverageParams):
     """The fusion weights, the samples and the number of components."""
 
-    criterion: str = param(
-        "uniform", "fusion weights: all equal (uniform), or given by 'weights'", choices=("uniform", "given")
-    )
-    weights: tuple[float, ...] = param(
-        (), "fusion weights for criterion given, one a source, sum 1", low=0.0, high=1.0, kind=float
-    )
     samples: int = param(5000, "samples in all", low=10)
     inflation: float = param(
         1.0, "alpha: factor on the covariances that samples are drawn from; above 1 it widens the result", low=1.0
@@ -69,18 +58,37 @@ def fuse(tracks: SourceTracks, params: GeometricMeanSamplingParams) -> FusedTrac
     """
 
     def fuse_piece(piece: SourceTracks, rngs: Generators) -> FusedTracks:
-        weights = average_weights(params.criterion, params.weights, piece.mean.shape[:-2], piece.count)
+        weights = params.shares(piece)
         parts = params.sources(piece).normalised
         drawn = sample_mean_density(parts, weights, "geometric", rngs[0], params.samples, params.inflation)
-        mixture = fit_mean_density(drawn, naive_product(parts, params))
+        mixture = fit_mean_density(drawn, _naive_product(parts, params))
         if params.inflation == 1.0:
             sole = params.weights.index(1.0) if 1.0 in params.weights else 0
-            mixture = chosen(all_same(parts) | (weights == 1.0).any(-1), nth(parts, sole), mixture)
+            mixture = chosen(_all_same(parts) | (weights == 1.0).any(-1), nth(parts, sole), mixture)
         info: dict[str, NDArray[Any]] = {"ess": drawn.ess / params.samples, "log_eta": drawn.log_eta}
         fused = fused_tracks(mixture, weights, info)
         return fused if tracks.mixture is not None else dataclasses.replace(fused, mixture=None)
 
     return fuse_sampled(tracks, tracks.count * params.samples, fuse_piece)
+
+
+def _naive_product(parts: Mixture, params: ReductionParams) -> LogMixture:
+    """Product (..., M) of K mixtures (..., K, C), brought down to `max_components` after each source."""
+    fused = LogMixture.of(nth(parts, 0))
+    for k in range(1, parts.weight.shape[-2]):
+        both = product(fused, LogMixture.of(nth(parts, k)))
+        reduced = params.reduce(both.normalised)
+        fused = LogMixture.of(reduced) if reduced.count < both.mean.shape[-2] else both
+    return fused
+
+
+def _all_same(parts: Mixture) -> NDArray[np.bool_]:
+    """Tell where all K mixtures (..., K, C) are equal, (...)."""
+    first = nth(parts, 0)
+    alike = np.ones(first.weight.shape[:-1], bool)
+    for k in range(1, parts.weight.shape[-2]):
+        alike &= same(first, nth(parts, k))
+    return alike
 
 
 RULE = Rule(
@@ -95,4 +103,5 @@ RULE = Rule(
     source="Sharma (61)-(65), (67)-(73)",
     cost="K S n^2 for S samples",
     optional=("seed",),
+    example=Example(({"samples": 5000}, {**GIVEN, "samples": 5000}), idempotent=True, monte_carlo=0.15),
 )

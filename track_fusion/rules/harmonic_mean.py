@@ -7,21 +7,23 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.mean_density import fit_mean_density, sample_mean_density
 from track_fusion.densities.mixture.algebra import LogMixture, product
+from track_fusion.densities.mixture.mean_density import fit_mean_density, sample_mean_density
 from track_fusion.densities.mixture.mixture import Mixture, chosen, moments, same, stacked
 from track_fusion.linalg import Array, matvec, outer, transpose
 from track_fusion.params import param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
-from track_fusion.rules.mixture_common import Generators, ReductionParams, Step, fold_mixtures, fuse_sampled
-from track_fusion.rules.pairwise import PairFusion, fold, share_of_first
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.folding import PairFusion, Step, fold, fold_mixtures, share_of_first
+from track_fusion.rules.shared.mixtures import ReductionParams
+from track_fusion.rules.shared.sampling import Generators, fuse_sampled
+from track_fusion.rules.shared.weights import GIVEN, TRACE, WeightParams
 from track_fusion.solvers.optimise import Derivatives, Solution, minimise_on_interval
 from track_fusion.solvers.pair import Pair
 from track_fusion.weights.merging import pair_derivatives
 
 
 @dataclasses.dataclass(frozen=True)
-class HarmonicMeanParams(ReductionParams):
+class HarmonicMeanParams(WeightParams, ReductionParams):
     """How the harmonic mean is evaluated, and how its weights omega are chosen; components count for sampling only."""
 
     method: str = param(
@@ -35,9 +37,6 @@ class HarmonicMeanParams(ReductionParams):
         "what of the inverse covariance of the denominator the weights minimise, eq. (77): its determinant (does not "
         "depend on units), its trace (does), or nothing (given by 'weights')",
         choices=("det", "trace", "given"),
-    )
-    weights: tuple[float, ...] = param(
-        (), "fusion weights for criterion given, one a source, sum 1", low=0.0, high=1.0, kind=float
     )
     samples: int = param(5000, "samples for method sampling, in all", low=10)
     inflation: float = param(
@@ -80,9 +79,7 @@ def fuse(tracks: SourceTracks, params: HarmonicMeanParams) -> FusedTracks:
     References     N. Sharma et al., Harmonic Mean Density Fusion in Distributed Tracking: Performance and
                    Comparison, eqs. (11), (31)-(35), (77); by sampling (66), (69)-(73).
     """
-    if params.weights and params.criterion != "given":
-        raise ValueError(f"The 'weights' parameter needs criterion 'given'. Got criterion {params.criterion!r}.")
-    given = check_weights(params.weights, tracks.count) if params.criterion == "given" else None
+    given = params.given(tracks.count)
     if params.method == "sampling":
         return fuse_sampled(
             tracks, tracks.count * params.samples, lambda piece, rngs: _fuse_by_sampling(piece, params, given, rngs)
@@ -91,7 +88,7 @@ def fuse(tracks: SourceTracks, params: HarmonicMeanParams) -> FusedTracks:
     def kernel(x1: Array, p1: Array, x2: Array, p2: Array, share: float | None) -> PairFusion:
         pair = Pair.of(p1, p2)
         difference = pair.coordinates(x1 - x2)
-        return _fuse_at(pair, x2, difference, _found(pair, difference, params.criterion, share))
+        return _fuse_at(pair, x2, difference, _search(pair, difference, params.criterion, share))
 
     return fold(tracks, kernel, given)
 
@@ -102,47 +99,34 @@ def _fuse_by_sampling(
     """Fuse by HMD-S; the weights (77) are those of the Gaussians with the densities' moments."""
 
     def step(first: Mixture, second: Mixture, k: int) -> Step:
-        lead, n = first.weight.shape[:-1], first.mean.shape[-1]
-        (x1, p1), (x2, p2) = (_flat(*moments(m), n) for m in (first, second))
-        pair = Pair.of(p1, p2)
+        lead, parts = first.weight.shape[:-1], stacked(first, second)
+        mean, cov = SourceTracks(*moments(parts)).flat
+        pair = Pair.of(cov[:, 0], cov[:, 1])
         share = None if given is None else share_of_first(given, k)
-        found = _found(pair, pair.coordinates(x1 - x2), params.criterion, share)
-        omega = found.weights.reshape(lead)
-        parts = stacked(first, second)
+        search = _search(pair, pair.coordinates(mean[:, 0] - mean[:, 1]), params.criterion, share)
+        omega = search.weights.reshape(lead)
         weights = np.stack([omega, 1.0 - omega], -1)
         drawn = sample_mean_density(parts, weights, "harmonic", rngs[k - 1], params.samples, params.inflation)
         fused = fit_mean_density(drawn, product(LogMixture.of(first), LogMixture.of(second)))
         if params.inflation == 1.0:
             fused = chosen((omega == 1.0) | same(first, second), first, chosen(omega == 0.0, second, fused))
         info = {
-            "converged": found.converged.reshape(lead),
-            "iterations": found.iterations.reshape(lead),
+            "converged": search.converged.reshape(lead),
+            "iterations": search.iterations.reshape(lead),
             "ess": drawn.ess / params.samples,
             "log_eta": drawn.log_eta,
         }
         return Step(fused, omega, info)
 
-    start = {"converged": True, "iterations": 0, "ess": 1.0, "log_eta": 0.0}
-    fused = fold_mixtures(tracks, params, step, start)
+    fused = fold_mixtures(tracks, params, step, ("converged", "iterations", "ess", "log_eta"))
     return fused if tracks.mixture is not None else dataclasses.replace(fused, mixture=None)
 
 
-def _flat(mean: Array, cov: Array, n: int) -> tuple[Array, Array]:
-    size = mean.size // n
-    return mean.reshape(size, n), cov.reshape(size, n, n)
-
-
-def _found(pair: Pair, difference: Array, criterion: str, share: float | None) -> Solution:
-    """Weights of track 1 by the criterion, or the given one."""
-    if share is None:
-        return _weights(pair, difference, criterion)
+def _search(pair: Pair, difference: Array, criterion: str, share: float | None) -> Solution:
+    """Weights of track 1, given or by (77): (1 - w) P1 + w P2 + w (1 - w) d d' shall be large."""
     count = difference.shape[1]
-    return Solution(np.full(count, share), np.ones(count, bool), np.zeros(count, np.intp))
-
-
-def _weights(pair: Pair, difference: Array, criterion: str) -> Solution:
-    """Weights of track 1 by (77): (1 - w) P1 + w P2 + w (1 - w) d d' shall be large."""
-    count = difference.shape[1]
+    if share is not None:
+        return Solution.known(np.full(count, share))
     if criterion == "trace":
         return minimise_on_interval(_trace_derivatives(pair, difference), count)
     mirrored = minimise_on_interval(pair_derivatives(pair, difference, np.zeros(count)), count)
@@ -168,13 +152,13 @@ def _trace_derivatives(pair: Pair, difference: Array) -> Derivatives:
     return derivatives
 
 
-def _fuse_at(pair: Pair, x2: Array, e: Array, found: Solution) -> PairFusion:
+def _fuse_at(pair: Pair, x2: Array, e: Array, search: Solution) -> PairFusion:
     """Fuse at weights where both covariances are diagonal and P1 + P2 = 1; e (n, B) is the difference of the means.
 
     With D = (1 - w) P1 + w P2, S = D - P1 P2 = (1 - w) P1^2 + w P2^2, v = w (1 - w), the matrix
     P1^-1 + P2^-1 - (D + v e e')^-1 is diagonal with one of rank one, so that its inverse is F - c g g'.
     """
-    p, q, w = pair.first, pair.second, found.weights
+    p, q, w = pair.first, pair.second, search.weights
     v = w * (1.0 - w)
     whole, rest = (1.0 - w) * p + w * q, (1.0 - w) * p * p + w * q * q
     spread = v * (e * e / whole).sum(0)
@@ -186,7 +170,7 @@ def _fuse_at(pair: Pair, x2: Array, e: Array, found: Solution) -> PairFusion:
     pull = e * force / rest - c * g * (e * e * force / (rest * whole)).sum(0)
     column = pair.from_coordinates(g)
     cov = pair.rebuild(p * q * whole / rest) - c[:, None, None] * outer(column)
-    return PairFusion(x2 + pair.from_coordinates(pull), cov, w, found.converged, found.iterations)
+    return PairFusion(x2 + pair.from_coordinates(pull), cov, search)
 
 
 RULE = Rule(
@@ -204,4 +188,8 @@ RULE = Rule(
     optional=("seed",),
     optional_when=(("seed", "method", "sampling"),),
     affine_equivariant="not with criterion trace: the trace depends on the units of the axes",
-)
+    example=Example(
+        ({}, TRACE, GIVEN, {"method": "sampling", "samples": 5000}),
+        not_equivariant=(TRACE,), idempotent=True, monte_carlo=0.15,
+    ),
+)  # fmt: skip

@@ -8,15 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.linalg import Array
-from track_fusion.params import Params, param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
-from track_fusion.rules.pairwise import PairFusion, fold
+from track_fusion.params import param
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.folding import PairFusion, fold
+from track_fusion.rules.shared.weights import GIVEN, TRACE, WeightParams
 from track_fusion.solvers.optimise import Derivatives, Solution, minimise_on_interval
 from track_fusion.solvers.pair import Pair
 
 
 @dataclasses.dataclass(frozen=True)
-class InverseCovarianceIntersectionParams(Params):
+class InverseCovarianceIntersectionParams(WeightParams):
     """How the weights omega are chosen."""
 
     criterion: str = param(
@@ -59,33 +60,28 @@ def fuse(tracks: SourceTracks, params: InverseCovarianceIntersectionParams) -> F
                    Comparison, eq. (47), with the factor of the fused covariance that its mean lacks; B. Noack et
                    al., Decentralized data fusion with inverse covariance intersection, 2017.
     """
-    if params.weights and params.criterion != "given":
-        raise ValueError(f"The 'weights' parameter needs criterion 'given'. Got criterion {params.criterion!r}.")
-    given = check_weights(params.weights, tracks.count) if params.criterion == "given" else None
 
     def kernel(x1: Array, p1: Array, x2: Array, p2: Array, share: float | None) -> PairFusion:
         pair = Pair.of(p1, p2)
         if share is None:
-            found = minimise_on_interval(_derivatives(pair, params.criterion), len(x1))
-        else:
-            found = Solution(np.full(len(x1), share), np.ones(len(x1), bool), np.zeros(len(x1), np.intp))
-        return _fuse_at(pair, x1, x2, found)
+            return _fuse_at(pair, x1, x2, minimise_on_interval(_derivatives(pair, params.criterion), len(x1)))
+        return _fuse_at(pair, x1, x2, Solution.known(np.full(len(x1), share)))
 
-    return fold(tracks, kernel, given)
+    return fold(tracks, kernel, params.given(tracks.count))
 
 
-def _fuse_at(pair: Pair, x1: Array, x2: Array, found: Solution) -> PairFusion:
+def _fuse_at(pair: Pair, x1: Array, x2: Array, search: Solution) -> PairFusion:
     """Fuse at weights where both covariances are diagonal and P1 + P2 = 1.
 
     With M = w P1 + (1 - w) P2 the fused variance is P1 P2 M / (M - P1 P2), and M - P1 P2 is
     w P1^2 + (1 - w) P2^2: nothing is subtracted.
     """
-    p, q, w = pair.first, pair.second, found.weights
+    p, q, w = pair.first, pair.second, search.weights
     near, far = w * p * p, (1.0 - w) * q * q
     gain = far / (near + far)
     mean = x2 + pair.from_coordinates(gain * pair.coordinates(x1 - x2))
     cov = pair.rebuild(p * q * (w * p + (1.0 - w) * q) / (near + far))
-    return PairFusion(mean, cov, w, found.converged, found.iterations)
+    return PairFusion(mean, cov, search)
 
 
 def _derivatives(pair: Pair, criterion: str) -> Derivatives:
@@ -122,4 +118,5 @@ RULE = Rule(
     order_matters=True,
     affine_equivariant="not with criterion trace: the trace depends on the units of the axes",
     linear=True,
+    example=Example(({}, TRACE, GIVEN), not_equivariant=(TRACE,), idempotent=True),
 )

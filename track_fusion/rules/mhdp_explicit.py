@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
+
 from track_fusion.densities.elliptical.spd_means import log_euclidean_mean
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.elliptical_tracks import MhdpParams, family_of, projected
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.elliptical import HEAVY_TAILS, MhdpParams, fuse_projected
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,9 +28,7 @@ def fuse(tracks: SourceTracks, params: MhdpExplicitParams) -> FusedTracks:
 
     Returns
     -------
-    FusedTracks    mean (..., n), cov (..., n, n), weights (..., K) of (45), dof (...): the least dof of a target's
-                   tracks for family student_t, else None. info: converged, iterations (of the mean), snapped: the
-                   source whose estimate is the mean, -1 for none
+    FusedTracks    as of mhdp_iterative
 
     Raises
     ------
@@ -45,16 +45,7 @@ def fuse(tracks: SourceTracks, params: MhdpExplicitParams) -> FusedTracks:
     References     X. Chen and J. Zhou, Multisensor Estimation Fusion on Statistical Manifold, 2022, Algorithms
                    1 and 3, eqs. (39)-(40), (45), (48), (64)-(65).
     """
-    batch, n = tracks.mean.shape[:-2], tracks.mean.shape[-1]
-    family, dof = family_of(tracks, params)
-    found, covs = projected(tracks, family, params.criterion == "squared")
-    info = {
-        "converged": found.converged.reshape(batch),
-        "iterations": found.iterations.reshape(batch),
-        "snapped": found.snapped.reshape(batch),
-    }
-    mean, cov = found.mean.reshape(*batch, n), log_euclidean_mean(covs).reshape(*batch, n, n)
-    return FusedTracks(mean, cov, found.weights.reshape(tracks.mean.shape[:-1]), dof, info=info)
+    return fuse_projected(tracks, params, lambda covs: (log_euclidean_mean(covs), np.ones(len(covs), bool)))
 
 
 RULE = Rule(
@@ -69,4 +60,5 @@ RULE = Rule(
     source="Chen 2022 (39)-(40), (45), (48), (64)",
     cost="K n^3, about twenty times",
     affine_equivariant=False,
+    example=Example(({}, {"criterion": "unsquared"}, HEAVY_TAILS), idempotent=True),
 )

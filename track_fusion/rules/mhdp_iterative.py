@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from numpy.typing import NDArray
 
 from track_fusion.densities.elliptical.spd_means import karcher_mean
-from track_fusion.densities.gaussian import weighted_product
+from track_fusion.linalg import Array
 from track_fusion.params import param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.elliptical_tracks import MhdpParams, family_of, projected
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.elliptical import HEAVY_TAILS, MhdpParams, fuse_projected
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,21 +54,12 @@ def fuse(tracks: SourceTracks, params: MhdpIterativeParams) -> FusedTracks:
     References     X. Chen and J. Zhou, Multisensor Estimation Fusion on Statistical Manifold, 2022, Algorithms
                    1-2, eqs. (39)-(40), (45), (48)-(50), (58)-(59), with c alpha-hat where (51), (53) print x-hat.
     """
-    batch, n = tracks.mean.shape[:-2], tracks.mean.shape[-1]
-    family, dof = family_of(tracks, params)
-    found, covs = projected(tracks, family, params.criterion == "squared")
-    weights, converged = found.weights.reshape(tracks.mean.shape[:-1]), found.converged
-    if params.scatter == "intersection":
-        cov = weighted_product(tracks.mean, tracks.cov, weights)[1]
-    else:
-        mean = karcher_mean(covs)
-        cov, converged = mean.mean.reshape(*batch, n, n), converged & mean.converged
-    info = {
-        "converged": converged.reshape(batch),
-        "iterations": found.iterations.reshape(batch),
-        "snapped": np.asarray(found.snapped.reshape(batch)),
-    }
-    return FusedTracks(found.mean.reshape(*batch, n), cov, weights, dof, info=info)
+    return fuse_projected(tracks, params, _barycenter if params.scatter == "barycenter" else None)
+
+
+def _barycenter(covs: Array) -> tuple[Array, NDArray[np.bool_]]:
+    result = karcher_mean(covs)
+    return result.mean, result.converged
 
 
 RULE = Rule(
@@ -81,4 +73,5 @@ RULE = Rule(
     caveat="weights follow the means: a rare large error that most tracks share exceeds what is claimed by 36 %",
     source="Chen 2022 (39)-(40), (45), (48), (58)",
     cost="K n^3, about forty times",
+    example=Example(({}, {"criterion": "unsquared"}, {"scatter": "intersection"}, HEAVY_TAILS), idempotent=True),
 )

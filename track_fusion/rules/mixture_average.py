@@ -5,21 +5,14 @@ from __future__ import annotations
 import dataclasses
 
 from track_fusion.densities.mixture.algebra import average
-from track_fusion.params import param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.mixture_common import ReductionParams, average_weights, fused_tracks
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.mixtures import AverageParams, fused_tracks
+from track_fusion.rules.shared.weights import GIVEN
 
 
 @dataclasses.dataclass(frozen=True)
-class MixtureAverageParams(ReductionParams):
+class MixtureAverageParams(AverageParams):
     """The fusion weights and the number of components."""
-
-    criterion: str = param(
-        "uniform", "fusion weights: all equal (uniform), or given by 'weights'", choices=("uniform", "given")
-    )
-    weights: tuple[float, ...] = param(
-        (), "fusion weights for criterion given, one a source, sum 1", low=0.0, high=1.0, kind=float
-    )
 
 
 def fuse(tracks: SourceTracks, params: MixtureAverageParams) -> FusedTracks:
@@ -46,7 +39,7 @@ def fuse(tracks: SourceTracks, params: MixtureAverageParams) -> FusedTracks:
     References     T. Li et al., Second-order statistics analysis and comparison between arithmetic and
                    geometric average fusion, 2019, eq. (9).
     """
-    weights = average_weights(params.criterion, params.weights, tracks.mean.shape[:-2], tracks.count)
+    weights = params.shares(tracks)
     return fused_tracks(params.reduce(average(params.sources(tracks), weights)), weights)
 
 
@@ -61,4 +54,5 @@ RULE = Rule(
     caveat="of the merged moments, if every track is; not with reduction cap",
     source="Li 2019 (9)",
     cost="K C n^2 for C components a source, (K C)^2 n^3 to merge them",
+    example=Example(({}, GIVEN, {"max_components": 3}), ({}, GIVEN), idempotent=True),
 )

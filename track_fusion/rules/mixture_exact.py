@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.log_domain import log_sum_exp, normalised
-from track_fusion.densities.mixture.algebra import LogMixture, product
-from track_fusion.densities.mixture.mixture import Factored, Mixture, chosen, moments, same, sample
+from track_fusion.densities.mixture.mixture import Factored, Mixture, chosen, moments, same, sample, take_components
 from track_fusion.densities.mixture.proposals import (
     MOST_SPREAD,
     indirect_global_sampling,
@@ -31,17 +30,18 @@ from track_fusion.densities.mixture.quotient import (
 from track_fusion.densities.mixture.sampling import Weighted, weighted_em
 from track_fusion.linalg import Array, asymmetric, is_positive_definite
 from track_fusion.params import param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.mixture_common import (
-    Generators,
-    Step,
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.folding import Step, fold_mixtures
+from track_fusion.rules.shared.quotients import (
+    QuotientParams,
+    closed_form_where,
     either,
-    fold_mixtures,
-    fuse_sampled,
     has_one_component,
     heaviest,
+    multiply,
+    sample_mixands,
 )
-from track_fusion.rules.mixture_quotients import QuotientParams, sample_mixands
+from track_fusion.rules.shared.sampling import Generators, fuse_sampled
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +94,6 @@ def fuse(tracks: SourceTracks, params: MixtureExactParams) -> FusedTracks:
                    eqs. (6), (13), (22), (26)-(37), (46)-(56), Algorithms 2 to 5.
     """
     common_information(tracks)  # says what is wrong before the batch is cut
-    start = {"converged": True, "ess": 1.0, "log_eta": 0.0, "pruned": 0.0, "skipped": 0}
 
     def fuse_piece(piece: SourceTracks, rngs: Generators) -> FusedTracks:
         shared = common_information(piece)
@@ -102,7 +101,7 @@ def fuse(tracks: SourceTracks, params: MixtureExactParams) -> FusedTracks:
         def step(first: Mixture, second: Mixture, k: int) -> Step:
             return _fuse_pair(first, second, shared[k - 1], params, rngs[k - 1])
 
-        return fold_mixtures(piece, params, step, start)
+        return fold_mixtures(piece, params, step, ("converged", "ess", "log_eta", "pruned", "skipped"))
 
     return fuse_sampled(tracks, params.points(tracks), fuse_piece)
 
@@ -145,34 +144,24 @@ def _fuse_pair(
     first: Mixture, second: Mixture, common: Mixture, params: MixtureExactParams, rng: np.random.Generator
 ) -> Step:
     if params.method == "naive_bayes":
-        whole = product(LogMixture.of(first), LogMixture.of(second))
-        return Step(whole.normalised, None, _info(first) | {"log_eta": log_sum_exp(whole.log_weight)})
+        return multiply(first, second)
     silent = same(first, common), same(second, common)
-    nothing_new = silent[0] | silent[1]
+    known = silent[0] | silent[1]
     # A source that says no more than what both share gives the other, whatever the quotient.
-    answer = Step(chosen(silent[0], second, first), None, _info(first))
+    answer = Step(chosen(silent[0], second, first), None, {})
     single = has_one_component(first) & has_one_component(second) & has_one_component(common)
-    fused = answer
-    if not single.all():
-        fused = _by(params.method, Problem.of(first, second, common, nothing_new), params, rng)
-    if single.any():
-        closed = Problem.of(heaviest(first), heaviest(second), heaviest(common), nothing_new | ~single)
-        fused = either(single, _by("mmgd", closed, params, rng), fused)
-    return either(nothing_new, answer, fused)
 
+    def by(method: str, problem: Problem) -> Step:
+        mixture, info = METHODS[method](problem, params, rng)
+        return Step(mixture, None, info)
 
-def _info(first: Mixture) -> dict[str, NDArray[Any]]:
-    """Diagnostics (...) of a fusion without sampling."""
-    lead = first.weight.shape[:-1]
-    return {
-        "converged": np.ones(lead, bool), "ess": np.ones(lead), "log_eta": np.zeros(lead), "pruned": np.zeros(lead),
-        "skipped": np.zeros(lead, np.intp),
-    }  # fmt: skip
-
-
-def _by(method: str, problem: Problem, params: MixtureExactParams, rng: np.random.Generator) -> Step:
-    fused, more = METHODS[method](problem, params, rng)
-    return Step(fused, None, _info(problem.first) | more)
+    ones = heaviest(first), heaviest(second), heaviest(common)
+    fused = closed_form_where(
+        single,
+        lambda: by("mmgd", Problem.of(*ones, known | ~single)),
+        lambda: by(params.method, Problem.of(first, second, common, known)),
+    )
+    return either(known, answer, fused)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -230,25 +219,20 @@ def _dls(problem: Problem, params: MixtureExactParams, rng: np.random.Generator)
     kept = prune_mixands(quotient, bound.log_weight, found.log_moment, params.prune_nats)
 
     def approximate() -> Laplace:
-        return Laplace(*(_take(a, kept.order) for a in found))
+        return Laplace(*(take_components(a, kept.order) for a in found))
 
     def wide(near: Laplace) -> Array:
         """Covariances of the Gaussians above the mixands; where there is none, the widest that heavy tails allow."""
-        sure = _take(bound.sure, kept.order)
-        return np.where(sure[..., None, None], _take(bound.cov, kept.order), MOST_SPREAD * near.cov)
+        sure = take_components(bound.sure, kept.order)
+        return np.where(sure[..., None, None], take_components(bound.cov, kept.order), MOST_SPREAD * near.cov)
 
     mixture, more = sample_mixands(kept, problem.first, problem.second, approximate, wide, params, rng)
     return mixture, info | more
 
 
-def _take(array: NDArray[Any], order: NDArray[np.intp]) -> NDArray[Any]:
-    tail = (1,) * (array.ndim - order.ndim)
-    return np.take_along_axis(array, order.reshape(*order.shape, *tail), order.ndim - 1)
-
-
 def _igs(problem: Problem, params: MixtureExactParams, rng: np.random.Generator) -> Result:
     quotient, _, found, info = _prepared(problem, params)
-    proposal = laplace_proposal(quotient, params.inflation, found)
+    proposal = laplace_proposal(found, params.inflation)
     result = indirect_global_sampling(quotient, proposal, rng, params.samples)
     ess = result.samples.ess / params.samples
     return result.mixture, info | {"ess": ess, "log_eta": result.samples.log_eta}
@@ -300,4 +284,5 @@ RULE = Rule(
     order_matters=True,
     needs=("common",),
     optional=("seed",),
+    example=Example(({"mixand_samples": 400}, {"method": "igs", "samples": 2000}), idempotent=False, monte_carlo=0.3),
 )

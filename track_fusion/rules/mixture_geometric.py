@@ -4,21 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 
-from track_fusion.params import param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.mixture_common import ReductionParams, average_weights, fused_tracks, geometric_average
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.mixtures import AverageParams, fused_tracks, geometric_average
+from track_fusion.rules.shared.weights import GIVEN
 
 
 @dataclasses.dataclass(frozen=True)
-class MixtureGeometricParams(ReductionParams):
+class MixtureGeometricParams(AverageParams):
     """The fusion weights and the number of components."""
-
-    criterion: str = param(
-        "uniform", "fusion weights: all equal (uniform), or given by 'weights'", choices=("uniform", "given")
-    )
-    weights: tuple[float, ...] = param(
-        (), "fusion weights for criterion given, one a source, sum 1", low=0.0, high=1.0, kind=float
-    )
 
 
 def fuse(tracks: SourceTracks, params: MixtureGeometricParams) -> FusedTracks:
@@ -48,7 +41,7 @@ def fuse(tracks: SourceTracks, params: MixtureGeometricParams) -> FusedTracks:
     References     T. Li et al., Second-order statistics analysis and comparison between arithmetic and
                    geometric average fusion, 2019, eqs. (49)-(51).
     """
-    weights = average_weights(params.criterion, params.weights, tracks.mean.shape[:-2], tracks.count)
+    weights = params.shares(tracks)
     return fused_tracks(geometric_average(tracks, weights, params), weights)
 
 
@@ -63,4 +56,5 @@ RULE = Rule(
     caveat="one component: covariance intersection; for several the power is an approximation",
     source="Li 2019 (49)-(51)",
     cost="C^K n^3 for C components a source",
+    example=Example(({}, GIVEN), idempotent=False),
 )

@@ -4,27 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 
-from track_fusion.params import param
-from track_fusion.rules.base import FusedTracks, Mixture, Rule, SourceTracks
-from track_fusion.rules.mixture_common import (
-    ReductionParams,
-    average_weights,
+from track_fusion.rules.base import Example, FusedTracks, Mixture, Rule, SourceTracks
+from track_fusion.rules.shared.mixtures import (
+    AverageParams,
     fused_tracks,
     geometric_average,
     source_mixtures,
 )
+from track_fusion.rules.shared.weights import GIVEN
 
 
 @dataclasses.dataclass(frozen=True)
-class MixtureHybridParams(ReductionParams):
+class MixtureHybridParams(AverageParams):
     """The fusion weights and the number of components."""
-
-    criterion: str = param(
-        "uniform", "fusion weights: all equal (uniform), or given by 'weights'", choices=("uniform", "given")
-    )
-    weights: tuple[float, ...] = param(
-        (), "fusion weights for criterion given, one a source, sum 1", low=0.0, high=1.0, kind=float
-    )
 
 
 def fuse(tracks: SourceTracks, params: MixtureHybridParams) -> FusedTracks:
@@ -51,7 +43,7 @@ def fuse(tracks: SourceTracks, params: MixtureHybridParams) -> FusedTracks:
     References     T. Li et al., Second-order statistics analysis and comparison between arithmetic and
                    geometric average fusion, 2019, section 5.2, eqs. (49)-(51).
     """
-    weights = average_weights(params.criterion, params.weights, tracks.mean.shape[:-2], tracks.count)
+    weights = params.shares(tracks)
     where = geometric_average(tracks, weights, params)
     number = (weights * source_mixtures(tracks).weight.sum(-1)).sum(-1)
     return fused_tracks(Mixture(number[..., None] * where.weight, where.mean, where.cov), weights)
@@ -68,4 +60,5 @@ RULE = Rule(
     caveat="one component: covariance intersection; keeps the mean number of targets, not every target",
     source="Li 2019 section 5.2, (49)-(51)",
     cost="C^K n^3 for C components a source",
+    example=Example(({}, GIVEN), idempotent=False),
 )

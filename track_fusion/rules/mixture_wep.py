@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.gaussian import weighted_product
-from track_fusion.densities.log_domain import log_of, log_sum_exp, normalised
+from track_fusion.densities.log_domain import log_of, normalised
 from track_fusion.densities.mixture.algebra import LogMixture, first_order, product
 from track_fusion.densities.mixture.mixture import Mixture, chosen, same, stacked
 from track_fusion.densities.mixture.proposals import prune_mixands
@@ -27,23 +25,25 @@ from track_fusion.densities.mixture.sampling import (
 from track_fusion.linalg import Array
 from track_fusion.params import param
 from track_fusion.rules import covariance_intersection
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
-from track_fusion.rules.mixture_common import (
-    Generators,
-    Step,
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.geometric_average import GeometricAverageParams
+from track_fusion.rules.geometric_average import fuse as geometric_average
+from track_fusion.rules.shared.folding import Step, fold_mixtures, share_of_first
+from track_fusion.rules.shared.quotients import (
+    QuotientParams,
+    closed_form_where,
     either,
-    fold_mixtures,
-    fuse_sampled,
     has_one_component,
     heaviest,
+    multiply,
+    sample_mixands,
 )
-from track_fusion.rules.mixture_quotients import QuotientParams, sample_mixands
-from track_fusion.rules.pairwise import share_of_first
-from track_fusion.weights.pooling import chernoff_weights, minimax_weights
+from track_fusion.rules.shared.sampling import Generators, fuse_sampled
+from track_fusion.rules.shared.weights import GIVEN, WeightParams
 
 
 @dataclasses.dataclass(frozen=True)
-class MixtureWepParams(QuotientParams):
+class MixtureWepParams(WeightParams, QuotientParams):
     """How the exponent omega is chosen and how the product of powers becomes a mixture."""
 
     method: str = param(
@@ -57,9 +57,6 @@ class MixtureWepParams(QuotientParams):
         "exponent omega: as far from either density (chernoff), nearest to naive fusion (minimax_information_loss), "
         "or given by 'weights'",
         choices=("chernoff", "minimax_information_loss", "given"),
-    )
-    weights: tuple[float, ...] = param(
-        (), "fusion weights for criterion given, one a source, sum 1", low=0.0, high=1.0, kind=float
     )
     omega_proposal: str = param(
         "overlap",
@@ -99,17 +96,14 @@ def fuse(tracks: SourceTracks, params: MixtureWepParams) -> FusedTracks:
     References     N. R. Ahmed, Decentralized Gaussian Mixture Fusion through Unified Quotient Approximations,
                    eqs. (7)-(11), (14)-(17), (23)-(25), Algorithms 1, 2, 3 and 5.
     """
-    if params.weights and params.criterion != "given":
-        raise ValueError(f"The 'weights' parameter needs criterion 'given'. Got criterion {params.criterion!r}.")
-    given = check_weights(params.weights, tracks.count) if params.criterion == "given" else None
-    start = {"converged": True, "iterations": 0, "ess": 1.0, "log_eta": 0.0, "pruned": 0.0}
+    given = params.given(tracks.count)
 
     def fuse_piece(piece: SourceTracks, rngs: Generators) -> FusedTracks:
         def step(first: Mixture, second: Mixture, k: int) -> Step:
             share = None if given is None else share_of_first(given, k)
             return _fuse_pair(first, second, params, rngs[k - 1], share)
 
-        return fold_mixtures(piece, params, step, start)
+        return fold_mixtures(piece, params, step, ("converged", "iterations", "ess", "log_eta", "pruned"))
 
     return fuse_sampled(tracks, params.points(tracks), fuse_piece)
 
@@ -118,40 +112,31 @@ def _fuse_pair(
     first: Mixture, second: Mixture, params: MixtureWepParams, rng: np.random.Generator, share: float | None
 ) -> Step:
     if params.method == "naive_bayes":
-        return _multiply(first, second)
+        return multiply(first, second)
     if params.method == "pcci":
         return _sample_pair(first, second, params, rng, share)
-    single = has_one_component(first) & has_one_component(second)
-    if single.all():
-        return _fuse_gaussians(heaviest(first), heaviest(second), params.criterion, share)
-    sampled = _sample_pair(first, second, params, rng, share)
-    if not single.any():
-        return sampled
-    return either(single, _fuse_gaussians(heaviest(first), heaviest(second), params.criterion, share), sampled)
+    return closed_form_where(
+        has_one_component(first) & has_one_component(second),
+        lambda: _fuse_gaussians(heaviest(first), heaviest(second), params.criterion, share),
+        lambda: _sample_pair(first, second, params, rng, share),
+    )
 
 
 def _sample_pair(
     first: Mixture, second: Mixture, params: MixtureWepParams, rng: np.random.Generator, share: float | None
 ) -> Step:
-    lead = first.weight.shape[:-1]
-    given = None if share is None else np.full(lead, share)
+    given = None if share is None else np.full(first.weight.shape[:-1], share)
     proposal = PROPOSALS[params.omega_proposal](first, second)
-    found = optimise_omega(first, second, rng, params.samples, params.criterion, given, proposal)
-    info: dict[str, NDArray[Any]] = {
-        "converged": found.converged,
-        "iterations": found.iterations,
-        "ess": found.samples.ess / params.samples,
-        "log_eta": found.samples.log_eta,
-        "pruned": np.zeros(lead),
-    }
+    search = optimise_omega(first, second, rng, params.samples, params.criterion, given, proposal)
+    how = {"converged": search.converged, "iterations": search.iterations}
+    drawn = {"ess": search.samples.ess / params.samples, "log_eta": search.samples.log_eta}
     # At the ends, and of equal sources, one source is the answer; 1/2 keeps the rest finite there.
-    ends = (found.omega == 0.0) | (found.omega == 1.0) | same(first, second)
-    inside = found._replace(omega=np.where(ends, 0.5, found.omega))
+    ends = (search.omega == 0.0) | (search.omega == 1.0) | same(first, second)
+    inside = search._replace(omega=np.where(ends, 0.5, search.omega))
     fused, more = METHODS[params.method](first, second, inside, params, rng)
-    omega = None if params.method == "pcci" else found.omega
-    known = {"ess": np.ones(lead), "log_eta": np.zeros(lead), "pruned": np.zeros(lead)}
-    answer = Step(chosen(found.omega > 0.0, first, second), omega, info | known)
-    return either(ends, answer, Step(fused, omega, info | more))
+    omega = None if params.method == "pcci" else search.omega
+    answer = Step(chosen(search.omega > 0.0, first, second), omega, how)
+    return either(ends, answer, Step(fused, omega, how | drawn | more))
 
 
 #: What Algorithm 1 draws from.
@@ -161,43 +146,19 @@ PROPOSALS: dict[str, Callable[[Mixture, Mixture], Mixture]] = {
 }
 
 
-def _multiply(first: Mixture, second: Mixture) -> Step:
-    """Fuse naively: nothing is searched or sampled."""
-    whole = product(LogMixture.of(first), LogMixture.of(second))
-    lead = whole.log_weight.shape[:-1]
-    info: dict[str, NDArray[Any]] = {
-        "converged": np.ones(lead, bool), "iterations": np.zeros(lead, np.intp), "ess": np.ones(lead),
-        "log_eta": log_sum_exp(whole.log_weight), "pruned": np.zeros(lead),
-    }  # fmt: skip
-    return Step(whole.normalised, None, info)
-
-
 def _fuse_gaussians(first: Mixture, second: Mixture, criterion: str, share: float | None) -> Step:
     """Fuse single components (...) exactly: the geometric average of Gaussians, without sampling."""
-    lead, n = first.weight.shape[:-1], first.mean.shape[-1]
     both = stacked(first, second)
-    mean, cov = both.mean[..., 0, :], both.cov[..., 0, :, :]
-    converged, iterations = np.ones(lead, bool), np.zeros(lead, np.intp)
-    if share is None:
-        search = chernoff_weights if criterion == "chernoff" else minimax_weights
-        size = math.prod(lead)
-        found = search(mean.reshape(size, 2, n), cov.reshape(size, 2, n, n))
-        omega = found.weights[:, 0].reshape(lead)
-        converged, iterations = found.converged.reshape(lead), found.iterations.reshape(lead)
-    else:
-        omega = np.full(lead, share)
-    fused = weighted_product(mean, cov, np.stack([omega, 1.0 - omega], -1))
+    given = () if share is None else (share, 1.0 - share)
+    params = GeometricAverageParams(criterion=criterion, weights=given)
+    fused = geometric_average(SourceTracks(both.mean[..., 0, :], both.cov[..., 0, :, :]), params)
+    assert fused.weights is not None
+    omega = fused.weights[..., 0]
     inside = (omega > 0.0) & (omega < 1.0)
-    middle = np.where(inside, omega, 0.5)
-    integral = wep_bound(first, second, middle)[..., 0]
-    info = {
-        "converged": converged,
-        "iterations": iterations,
-        "ess": np.ones(lead),
-        "log_eta": np.where(inside, integral, 0.0),
-        "pruned": np.zeros(lead),
-    }
-    return Step(Mixture(np.ones((*lead, 1)), fused[0][..., None, :], fused[1][..., None, :, :]), omega, info)
+    integral = wep_bound(first, second, np.where(inside, omega, 0.5))[..., 0]
+    info = {**fused.info, "log_eta": np.where(inside, integral, 0.0)}
+    one = np.ones((*omega.shape, 1))
+    return Step(Mixture(one, fused.mean[..., None, :], fused.cov[..., None, :, :]), omega, info)
 
 
 Result = tuple[Mixture, dict[str, NDArray[Any]]]
@@ -258,6 +219,14 @@ def _pairs(first: tuple[Array, int], second: tuple[Array, int]) -> Array:
 METHODS: dict[str, Method] = {"dls": _dls, "igs": _igs, "is_wem": _em, "foci": _foci, "pcci": _pcci}
 
 
+EXAMPLES = (
+    {"mixand_samples": 400, "samples": 4000},
+    {"method": "igs", "samples": 4000},
+    {"mixand_samples": 400, **GIVEN},
+    {"method": "foci", "criterion": "minimax_information_loss", "samples": 4000},
+    {"method": "pcci"},
+)
+
 RULE = Rule(
     key="mixture_wep",
     title="Weighted exponential product of mixtures",
@@ -271,4 +240,5 @@ RULE = Rule(
     cost="K C^2 S n^2 for C components a source and S samples a mixand",
     order_matters=True,
     optional=("seed",),
+    example=Example(EXAMPLES, idempotent=True, monte_carlo=0.3),
 )

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.elliptical.rao import manhattan_paths
-from track_fusion.densities.gaussian import weighted_product
 from track_fusion.linalg import Array, inverse, matvec, symmetrise, transpose
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks
-from track_fusion.rules.elliptical_tracks import EllipticalParams, family_of
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.shared.elliptical import HEAVY_TAILS, EllipticalParams, each, family_of
+from track_fusion.rules.shared.weights import pooled_by
 from track_fusion.solvers.least_squares import minimise_squares_on_simplex
 from track_fusion.solvers.optimise import Solution
 
@@ -58,41 +58,36 @@ def fuse(tracks: SourceTracks, params: QuasiMinimalManhattanParams) -> FusedTrac
                    distributions, 2021; X. Chen and J. Zhou, Multisensor Estimation Fusion on Statistical Manifold,
                    2022, eqs. (27)-(28), (45).
     """
-    batch, (count, n) = tracks.mean.shape[:-2], tracks.mean.shape[-2:]
     family, dof = family_of(tracks, params)
-    flat = SourceTracks(tracks.mean.reshape(-1, count, n), tracks.cov.reshape(-1, count, n, n))
-    constants = family.pull * family.kappa, family.radius_squared, 2.0 * family.b
-    pull, radius, weight = (np.broadcast_to(v, batch).reshape(-1) for v in constants)
-    chunk = max(1, CHUNK_NUMBERS // ((count + 1) * count * n * n))
-    parts = [
-        _weights(flat.mean[i : i + chunk], flat.cov[i : i + chunk], *(v[i : i + chunk] for v in (pull, radius, weight)))
-        for i in range(0, max(len(flat.mean), 1), chunk)
-    ]
-    found = Solution.concatenate(parts)
-    weights = found.weights.reshape(*batch, count)
-    mean, cov = weighted_product(tracks.mean, tracks.cov, weights)
-    info = {"converged": found.converged.reshape(batch), "iterations": found.iterations.reshape(batch)}
-    return FusedTracks(mean, cov, weights, dof, info=info)
+    constants = [each(tracks, v) for v in (family.pull * family.kappa, family.radius_squared, 2.0 * family.b)]
+
+    def find(mean: Array, cov: Array) -> Solution:
+        count, n = mean.shape[1:]
+        chunk = max(1, CHUNK_NUMBERS // ((count + 1) * count * n * n))
+        pieces = [slice(i, i + chunk) for i in range(0, max(len(mean), 1), chunk)]
+        return Solution.concatenate([_weights(mean[s], cov[s], *(v[s] for v in constants)) for s in pieces])
+
+    return dataclasses.replace(pooled_by(find, tracks), dof=dof)
 
 
 def _weights(mean: Array, cov: Array, pull: Array, radius: Array, weight: Array) -> Solution:
     """Find the weights of a flat batch, mean (B, K, n); pull is c kappa."""
     count = mean.shape[1]
     if count == 1:
-        return Solution(np.ones((len(mean), 1)), np.ones(len(mean), bool), np.zeros(len(mean), np.intp))
+        return Solution.known(np.ones((len(mean), 1)))
     distances = _Distances.of(mean, cov, pull, radius, weight)
     lean = np.where(np.eye(count, dtype=bool), LEAN, (1.0 - LEAN) / (count - 1))
     starts = np.concatenate([np.full((1, count), 1.0 / count), lean])
     batch, searches = len(mean), count + 1
     # All searches of the batch at once, the fusions running fastest.
-    found, value = minimise_squares_on_simplex(
+    search, value = minimise_squares_on_simplex(
         lambda w, rows: distances(w, rows % batch), np.repeat(starts, batch, axis=0)
     )
     value = value.reshape(searches, batch)
     # The first search wins unless another is lower by more than rounding.
     value[1:] = np.where(value[1:] < value[0] * (1.0 - TIE), value[1:], np.inf)
     best = value.argmin(0) * batch + np.arange(batch)
-    return Solution(found.weights[best], found.converged[best], found.iterations[best])
+    return search[best]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,4 +163,5 @@ RULE = Rule(
     caveat="weights follow the means: a rare large error that most tracks share exceeds what is claimed by 26 %",
     source="Chen 2022 (27)-(28), (45), section 5",
     cost="K^3 n^3, about twenty times",
+    example=Example(({}, HEAVY_TAILS), idempotent=True),
 )

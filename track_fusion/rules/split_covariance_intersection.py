@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.linalg import Array, inverse, matvec, symmetrise, transpose
-from track_fusion.params import Params, param
-from track_fusion.rules.base import FusedTracks, Rule, SourceTracks, check_weights
+from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
+from track_fusion.rules.covariance_intersection import EXAMPLES, CovarianceIntersectionParams
+from track_fusion.rules.shared.weights import TRACE, diagnostics
 from track_fusion.solvers.optimise import GradientHessian, minimise_on_simplex
 
 #: An independent part may leave the range from nothing to the covariance by this share of that: rounding.
@@ -19,18 +20,8 @@ SMALLEST = 1e-14
 
 
 @dataclasses.dataclass(frozen=True)
-class SplitCovarianceIntersectionParams(Params):
+class SplitCovarianceIntersectionParams(CovarianceIntersectionParams):
     """How the fusion weights omega are chosen."""
-
-    criterion: str = param(
-        "det",
-        "what the weights minimise: the fused determinant (does not depend on units), the fused trace "
-        "(does), nothing (uniform), or nothing (given by 'weights')",
-        choices=("det", "trace", "uniform", "given"),
-    )
-    weights: tuple[float, ...] = param(
-        (), "fusion weights for criterion given, one a source, sum 1", low=0.0, high=1.0, kind=float
-    )
 
 
 def fuse(tracks: SourceTracks, params: SplitCovarianceIntersectionParams) -> FusedTracks:
@@ -61,29 +52,20 @@ def fuse(tracks: SourceTracks, params: SplitCovarianceIntersectionParams) -> Fus
                    Comparison, section 1.1; S. Julier and J. Uhlmann, General decentralized data fusion with
                    covariance intersection, 2001.
     """
-    batch, (count, n) = tracks.mean.shape[:-2], tracks.mean.shape[-2:]
-    if params.weights and params.criterion != "given":
-        raise ValueError(f"The 'weights' parameter needs criterion 'given'. Got criterion {params.criterion!r}.")
-    mean, cov = tracks.mean.reshape(-1, count, n), tracks.cov.reshape(-1, count, n, n)
+    weights, info = params.fixed(tracks), {}
+    mean, cov = tracks.flat
     alone = _independent(tracks).reshape(cov.shape)
     parts = _Parts.of(mean, cov, alone)
-    info = {}
-    if params.criterion == "given":
-        weights = np.broadcast_to(check_weights(params.weights, count), mean.shape[:2])
-    elif params.criterion == "uniform" or count == 1:
-        weights = np.full(mean.shape[:2], 1.0 / count)
-    else:
-        found = minimise_on_simplex(_gradient_hessian(parts, params.criterion), len(mean), count)
-        weights = found.weights
-        info = {"converged": found.converged.reshape(batch), "iterations": found.iterations.reshape(batch)}
-    if count == 1:
-        fused_mean, fused_cov, left = mean[:, 0].copy(), cov[:, 0].copy(), alone[:, 0].copy()
-    else:
-        fused_mean, fused_cov, left = parts.fused_at(weights, mean[:, 0])
-    return FusedTracks(
-        fused_mean.reshape(*batch, n), fused_cov.reshape(*batch, n, n), weights.reshape(*batch, count),
-        info={**info, "independent_cov": left.reshape(*batch, n, n)},
-    )  # fmt: skip
+    if tracks.count == 1:
+        ones = np.ones(mean.shape[:2])
+        own = FusedTracks(mean[:, 0].copy(), cov[:, 0].copy(), ones, info={"independent_cov": alone[:, 0].copy()})
+        return own.shaped(tracks.batch)
+    if weights is None:
+        search = minimise_on_simplex(_gradient_hessian(parts, params.criterion), len(mean), tracks.count)
+        weights, info = search.weights, diagnostics(search)
+    weights = weights.reshape(mean.shape[:2])
+    fused_mean, fused_cov, left = parts.fused_at(weights, mean[:, 0])
+    return FusedTracks(fused_mean, fused_cov, weights, info={**info, "independent_cov": left}).shaped(tracks.batch)
 
 
 def _independent(tracks: SourceTracks) -> Array:
@@ -201,4 +183,5 @@ RULE = Rule(
     cost="K n^3, about ten times that for weights that are sought",
     needs=("independent_cov",),
     affine_equivariant="not with criterion trace: the trace depends on the units of the axes",
+    example=Example(EXAMPLES, EXAMPLES, (TRACE,), idempotent=False),
 )

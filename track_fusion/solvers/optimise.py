@@ -30,6 +30,19 @@ class Solution:
     converged: NDArray[np.bool_]
     iterations: NDArray[np.intp]
 
+    def of_both(self) -> Solution:
+        """Make weights (B, 2) of two sources of the first one's (B,)."""
+        return dataclasses.replace(self, weights=np.stack([self.weights, 1.0 - self.weights], -1))
+
+    def __getitem__(self, rows: NDArray[np.intp]) -> Solution:
+        """Pick some of the batch."""
+        return Solution(self.weights[rows], self.converged[rows], self.iterations[rows])
+
+    @staticmethod
+    def known(weights: Array) -> Solution:
+        """Take weights of a batch, (B,) or (B, K), for which nothing is sought."""
+        return Solution(weights, np.ones(len(weights), bool), np.zeros(len(weights), np.intp))
+
     @staticmethod
     def concatenate(parts: Sequence[Solution]) -> Solution:
         """Join the solutions of the pieces of a batch."""

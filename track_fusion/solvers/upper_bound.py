@@ -90,11 +90,11 @@ def _bound(start: Array, means: Array, covs: Array, sides: Array, criterion: Cri
         mean[at] = means[at, ruler[at]]
     rows = np.flatnonzero(~ruled)
     if len(rows):
-        shift, found, converged[rows], iterations[rows] = _search(
+        shift, least, converged[rows], iterations[rows] = _search(
             white[rows], points[rows], units[rows], criterion, free
         )
         mean[rows] += matvec(lower[rows], shift)
-        cov[rows] = symmetrise(lower[rows] @ found @ transpose(lower[rows]))
+        cov[rows] = symmetrise(lower[rows] @ least @ transpose(lower[rows]))
     return Bound(mean, cov, converged, iterations)
 
 
@@ -142,8 +142,8 @@ def _by_trace(white: Array, points: Array, units: Array, free: bool) -> _Part:
         slack -= outer(points)
     half = np.broadcast_to(np.eye(size) / np.sqrt(2.0), slack.shape)
     program = Program(start, slack, half, half, _entries(n, free), lambda y, rows: (slope[rows], None))
-    found, done, steps = solve(program)
-    return (found[:, :n, n] if free else np.zeros((batch, n))), found[:, :n, :n], done, steps
+    y, done, steps = solve(program)
+    return (y[:, :n, n] if free else np.zeros((batch, n))), y[:, :n, :n], done, steps
 
 
 def _by_det(white: Array, points: Array, units: Array, free: bool) -> _Part:
@@ -168,7 +168,7 @@ def _by_det(white: Array, points: Array, units: Array, free: bool) -> _Part:
         bend[:, :n, :n] = np.linalg.inv(y[:, :n, :n])
         return -2.0 * bend, np.sqrt(2.0) * bend
 
-    found, done, steps = solve(Program(start, slack, left, right, _entries(n, free), objective))
-    root = inverse(found[:, :n, :n])
-    mean = matvec(root, found[:, :n, n]) if free else np.zeros((batch, n))
+    y, done, steps = solve(Program(start, slack, left, right, _entries(n, free), objective))
+    root = inverse(y[:, :n, :n])
+    mean = matvec(root, y[:, :n, n]) if free else np.zeros((batch, n))
     return mean, root @ transpose(root), done, steps

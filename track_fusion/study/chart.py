@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
 
 from track_fusion.linalg import Array
+from track_fusion.metrics.accuracy import Estimate
 
 Style = Literal["line", "dashed", "dotted", "steps", "points", "bars"]
 
@@ -72,6 +74,22 @@ class Chart:
     log_y: bool = False
     equal: bool = False
     ticks: dict[float, str] | None = None
+
+
+def estimates(label: str, values: Mapping[int, Estimate] | Mapping[float, Estimate], style: Style = "points") -> Series:
+    """Figures over x with their standard errors."""
+    errors = np.nan_to_num([e.standard_error for e in values.values()])
+    return Series(label, np.array(list(values), float), np.array([e.value for e in values.values()]), style, errors)
+
+
+def bars(title: str, y_label: str, values: Mapping[str, Estimate], wanted: str = "", log_y: bool = False) -> Chart:
+    """Figures as bars side by side, by what stands below them; a line at 1 where `wanted` says what that is."""
+    places = [float(i) for i in range(len(values))]
+    series = [estimates("", dict(zip(places, values.values(), strict=True)), "bars")]
+    if wanted:
+        series.append(Series(wanted, np.array([0.0, len(values) - 1.0]), np.ones(2), "dashed"))
+    ticks = dict(zip(places, values, strict=True))
+    return Chart(title, "", y_label, tuple(series), log_y=log_y, ticks=ticks)
 
 
 #: Points around an ellipse.

@@ -8,22 +8,24 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from track_fusion.filters import iterated_corrector, particle
-from track_fusion.filters.iterated_corrector import GaussianUpdate
-from track_fusion.filters.particle import Particles
+from track_fusion.filters.base import Density, Gaussian, TrackFilter, TrackState
+from track_fusion.filters.iterated_corrector import IteratedCorrector
+from track_fusion.filters.particle import Particles, Sir, SirParams, union
 from track_fusion.linalg import Array
 from track_fusion.models.base import Transition
 from track_fusion.random_streams import stream
-from track_fusion.rules import RULES, FusedTracks, SourceTracks
+from track_fusion.rules import FusedTracks
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.covariance_union import CovarianceUnionParams
 from track_fusion.rules.naive import NaiveParams
-from track_fusion.study.scenario import RuleChoice, Tracking, fuse_runs
+from track_fusion.study.rule_choice import RuleChoice, fuse_runs
+from track_fusion.study.scene import Tracking
+from track_fusion.trackers.fusion_loop import BatchTracker, filtered, fusion_loop
 
 #: Particles of so many runs are worked on at once: larger arrays leave the cache.
 SIR_CHUNK = 50
@@ -44,19 +46,24 @@ RULE_CHOICES = (
 )
 
 
-class GaussianFilter(NamedTuple):
-    """A filter of means and covariances: its predict and update, as of filters/cubature.py."""
-
-    predict: Callable[[Array, Array, Transition], tuple[Array, Array]]
-    update: GaussianUpdate
-
-
-class Sample(NamedTuple):
-    """Monte Carlo runs: which, and what each sensor saw in them, (R, T, m) each."""
+class Draws(NamedTuple):
+    """What is drawn in R Monte Carlo runs: the truth (R, T + 1, n), and what each sensor saw, (R, T, m) each."""
 
     seed: int
     runs: Sequence[int]
+    truth: Array
     seen: Sequence[Array]
+
+    def part(self, rows: slice) -> Draws:
+        """Return some of the runs."""
+        return Draws(self.seed, self.runs[rows], self.truth[rows], [z[rows] for z in self.seen])
+
+
+def drawn(tracking: Tracking, runs: Sequence[int], seed: int) -> Draws:
+    """Draw the truth and the measurements of these Monte Carlo runs."""
+    truth = tracking.truths(seed, runs)
+    seen = [tracking.measurements(states, seed, run) for states, run in zip(truth, runs, strict=True)]
+    return Draws(seed, runs, truth, [np.stack([z[name] for z in seen]) for name in tracking.sensors])
 
 
 class Row(NamedTuple):
@@ -66,137 +73,98 @@ class Row(NamedTuple):
     (R, K) or (1, K).
     """
 
-    estimates: Callable[[Sample], Iterator[FusedTracks]]
+    estimates: Callable[[Draws], Iterator[FusedTracks]]
     chunk: int = 0
 
 
-def start(tracking: Tracking, runs: int) -> tuple[Array, Array]:
-    """Every run's initial mean (R, n) and covariance (R, n, n)."""
-    return np.tile(tracking.initial_mean, (runs, 1)), np.tile(tracking.initial_cov, (runs, 1, 1))
+class Filters(NamedTuple):
+    """The filters of a row: makes that of a sensor, by its name; how many runs they work on at once (0: all)."""
+
+    of: Callable[[Draws, str], TrackFilter[Any, Transition, Array, Any, Any]]
+    chunk: int = 0
 
 
-def gaussian_alone(tracking: Tracking, one: GaussianFilter, sensors: int) -> Row:
+def same_filters(one: TrackFilter[Gaussian, Transition, Array, Any, Any]) -> Filters:
+    """Give all sensors one filter, which draws no random numbers."""
+    return Filters(lambda draws, name: one)
+
+
+def sir_filters(params: SirParams) -> Filters:
+    """Give each sensor a particle filter with a stream of its own in each run."""
+
+    def of(draws: Draws, name: str) -> Sir:
+        return Sir(dataclasses.replace(params, seed=draws.seed, role=f"sir {name}"), tuple(draws.runs))
+
+    return Filters(of, SIR_CHUNK)
+
+
+def _start(tracking: Tracking, runs: int) -> tuple[Array, Array]:
+    """Mean (R, n) and covariance (1, n, n) of every run at the start: all share the covariance."""
+    return np.tile(tracking.initial_mean, (runs, 1)), tracking.initial_cov[None]
+
+
+def alone_row(tracking: Tracking, filters: Filters, sensors: int) -> Row:
     """One filter that uses the first so many sensors, one after the other (IC)."""
 
-    def estimates(sample: Sample) -> Iterator[FusedTracks]:
-        used = list(tracking.sensors.values())[:sensors]
-        mean, cov = start(tracking, len(sample.runs))
-        for k in range(tracking.steps):
-            mean, cov = one.predict(mean, cov, tracking.motion.over(tracking.dt_s))
-            zs = [z[:, k] for z in sample.seen[:sensors]]
-            mean, cov, _ = iterated_corrector.update(mean, cov, zs, used, one.update)
-            yield FusedTracks(mean, cov)
+    def estimates(draws: Draws) -> Iterator[FusedTracks]:
+        one = filters.of(draws, next(iter(tracking.sensors)))
+        scans = ([z[:, k] for z in draws.seen[:sensors]] for k in range(tracking.steps))
+        used, transition = list(tracking.sensors.values())[:sensors], tracking.motion.over(tracking.dt_s)
+        start = one.begin(*_start(tracking, len(draws.runs)))
+        for state in filtered(IteratedCorrector(one), start, transition, scans, used):
+            yield FusedTracks(*state.moments)
 
-    return Row(estimates)
-
-
-def gaussian_fused(tracking: Tracking, one: GaussianFilter, choice: RuleChoice) -> Row:
-    """One filter a sensor, fused after each step, the fused posterior fed back to all of them."""
-
-    def estimates(sample: Sample) -> Iterator[FusedTracks]:
-        rngs, (mean, cov) = fusion_streams(sample), start(tracking, len(sample.runs))
-        for k in range(tracking.steps):
-            mean, cov = one.predict(mean, cov, tracking.motion.over(tracking.dt_s))
-            pairs = zip(sample.seen, tracking.sensors.values(), strict=True)
-            local = [one.update(mean, cov, z[:, k], sensor)[:2] for z, sensor in pairs]
-            means, covs = (np.stack(parts, 1) for parts in zip(*local, strict=True))
-            fused = fuse_runs(RULES[choice.key], choice.params, means, covs, rngs)
-            mean, cov = fused.mean, fused.cov
-            yield fused
-
-    return Row(estimates)
+    return Row(estimates, filters.chunk)
 
 
-def fusion_streams(sample: Sample) -> list[np.random.Generator]:
-    """Return what a rule that samples draws from, a generator a run."""
-    return [stream(sample.seed, run, "fusion_centre") for run in sample.runs]
+def fused_row(tracking: Tracking, filters: Filters, choice: RuleChoice, join: bool = False) -> Row:
+    """One filter a sensor, fused after each step, the fused posterior fed back to all of them.
 
-
-@dataclasses.dataclass(frozen=True)
-class Sir:
-    """A sampling-importance-resampling filter: number of particles and way of resampling."""
-
-    count: int
-    resampling: str = "systematic"
-
-
-def _streams(sample: Sample, name: str) -> list[np.random.Generator]:
-    return [stream(sample.seed, run, f"sir {name}") for run in sample.runs]
-
-
-def sir_alone(tracking: Tracking, sir: Sir, sensors: int) -> Row:
-    """One particle filter weighted by the first so many sensors (IC), resampled after every step."""
-
-    def estimates(sample: Sample) -> Iterator[FusedTracks]:
-        used, rng = list(tracking.sensors.values())[:sensors], _streams(sample, next(iter(tracking.sensors)))
-        cloud = particle.from_gaussian(*start(tracking, len(sample.runs)), rng, sir.count)
-        for k in range(tracking.steps):
-            cloud = particle.predict(cloud, tracking.motion.over(tracking.dt_s), rng)
-            for z, sensor in zip(sample.seen, used, strict=False):
-                cloud, _ = particle.update(cloud, z[:, k], sensor)
-            yield FusedTracks(*particle.moments(cloud))
-            cloud = particle.RESAMPLING[sir.resampling](cloud, rng, sir.count)
-
-    return Row(estimates, SIR_CHUNK)
-
-
-def sir_fused(tracking: Tracking, sir: Sir, choice: RuleChoice, union: bool = False) -> Row:
-    """One particle filter a sensor, fused after each step and drawn again, each by itself, from what was fused.
-
-    The rule fuses the particles' Gaussian conversions. With `union` its weights join the particles
-    themselves: the arithmetic average of their densities.
+    The rule fuses the filters' moments. With `join` its weights join the particles themselves: the arithmetic average
+    of their densities, from which each filter draws by itself.
     """
 
-    def estimates(sample: Sample) -> Iterator[FusedTracks]:
-        streams = [_streams(sample, name) for name in tracking.sensors]
-        clouds = [particle.from_gaussian(*start(tracking, len(sample.runs)), rng, sir.count) for rng in streams]
-        for k in range(tracking.steps):
-            moved = [
-                particle.predict(cloud, tracking.motion.over(tracking.dt_s), rng)
-                for cloud, rng in zip(clouds, streams, strict=True)
-            ]
-            triples = zip(moved, sample.seen, tracking.sensors.values(), strict=True)
-            clouds = [particle.update(cloud, z[:, k], sensor)[0] for cloud, z, sensor in triples]
-            fused = RULES[choice.key].fuse(_converted(tracking, clouds), choice.params)
-            yield fused
-            clouds = [_drawn_again(clouds, fused, rng, sir, union) for rng in streams]
+    def estimates(draws: Draws) -> Iterator[FusedTracks]:
+        rngs = [stream(draws.seed, run, "fusion_centre") for run in draws.runs]  # for a rule that samples
 
-    return Row(estimates, SIR_CHUNK)
+        def fuse(states: Sequence[TrackState]) -> tuple[FusedTracks, Density]:
+            means, covs = (np.stack(part, 1) for part in zip(*(_moments(tracking, s) for s in states), strict=True))
+            tracks = fuse_runs(choice, means, covs, rngs, float(states[0].dof))
+            if not join:
+                return tracks, Gaussian(tracks.mean, tracks.cov)
+            assert tracks.weights is not None
+            return tracks, union([s for s in states if isinstance(s, Particles)], tracks.weights)
+
+        start, transition = _start(tracking, len(draws.runs)), tracking.motion.over(tracking.dt_s)
+        ones = [filters.of(draws, name) for name in tracking.sensors]
+        trackers = [
+            BatchTracker(one, one.begin(*start), transition, sensor)
+            for one, sensor in zip(ones, tracking.sensors.values(), strict=True)
+        ]
+        return fusion_loop(trackers, ([(z[:, k],) for z in draws.seen] for k in range(tracking.steps)), fuse)
+
+    return Row(estimates, filters.chunk)
 
 
-def sir_rows(tracking: Tracking, sir: Sir, choices: Sequence[RuleChoice]) -> dict[str, Row]:
+def _moments(tracking: Tracking, state: TrackState) -> tuple[Array, Array]:
+    mean, cov = state.moments
+    if isinstance(state, Particles):
+        cov = cov + COVARIANCE_FLOOR * np.diag(np.diagonal(tracking.initial_cov))
+    return mean, cov
+
+
+def sir_rows(tracking: Tracking, sir: SirParams, choices: Sequence[RuleChoice]) -> dict[str, Row]:
     """Every row by particle filters; the arithmetic average joins the particles, or (@gaussian) their Gaussians.
 
     Without fusion also by multinomial resampling, whose draws are independent and add more noise.
     """
-    table = {"sir-alone": sir_alone(tracking, sir, 1), "sir-ic": sir_alone(tracking, sir, 2)}
-    noisier = dataclasses.replace(sir, resampling="multinomial")
-    table |= {f"{row}@multinomial": sir_alone(tracking, noisier, i) for i, row in enumerate(list(table), 1)}
+    filters = sir_filters(sir)
+    noisier = sir_filters(dataclasses.replace(sir, resampling="multinomial"))
+    table = {"sir-alone": alone_row(tracking, filters, 1), "sir-ic": alone_row(tracking, filters, 2)}
+    table |= {f"{row}@multinomial": alone_row(tracking, noisier, i) for i, row in enumerate(list(table), 1)}
     for choice in choices:
         averaged = choice.key == "arithmetic_average"
-        table[f"sir-{choice.name}"] = sir_fused(tracking, sir, choice, union=averaged)
+        table[f"sir-{choice.name}"] = fused_row(tracking, filters, choice, join=averaged)
         if averaged:
-            table[f"sir-{choice.name}@gaussian"] = sir_fused(tracking, sir, choice)
+            table[f"sir-{choice.name}@gaussian"] = fused_row(tracking, filters, choice)
     return table
-
-
-def _converted(tracking: Tracking, clouds: Sequence[Particles]) -> SourceTracks:
-    moments = [particle.moments(cloud) for cloud in clouds]
-    floor = COVARIANCE_FLOOR * np.diag(np.diagonal(tracking.initial_cov))
-    return SourceTracks(np.stack([m for m, _ in moments], 1), np.stack([c + floor for _, c in moments], 1))
-
-
-def _drawn_again(
-    clouds: Sequence[Particles], fused: FusedTracks, rng: list[np.random.Generator], sir: Sir, union: bool
-) -> Particles:
-    if not union:
-        return particle.from_gaussian(fused.mean, fused.cov, rng, sir.count)
-    assert fused.weights is not None
-    return particle.RESAMPLING[sir.resampling](particle.union(clouds, fused.weights), rng, sir.count)
-
-
-def drawn(tracking: Tracking, runs: Sequence[int], seed: int) -> tuple[Array, Sample]:
-    """Draw the truth (R, T + 1, n) and the measurements of these Monte Carlo runs."""
-    truth = tracking.truths(seed, runs)
-    seen = [tracking.measurements(states, seed, run) for states, run in zip(truth, runs, strict=True)]
-    return truth, Sample(seed, runs, [np.stack([s[name] for s in seen]) for name in tracking.sensors])

@@ -12,8 +12,10 @@ from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate, armse, rmse
 from track_fusion.rules import FusedTracks
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.one_target import Row, Sample, drawn
-from track_fusion.study.scenario import Progress, RuleChoice, Samples, Tracking, check_needs, chosen
+from track_fusion.study.one_target import Row, drawn
+from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rule_choice import RuleChoice, check_needs
+from track_fusion.study.scene import Tracking
 
 TRUTH = "truth/position_m"
 CLAIMED = "claimed_position_m2"
@@ -36,7 +38,7 @@ class Quantity(NamedTuple):
 
     @property
     def error(self) -> str:
-        """Name of the errors in samples, (R, T, axes)."""
+        """Name of the errors in the outcomes, (R, T, axes)."""
         return f"{self.name}_error_{self.unit}"
 
     @property
@@ -67,7 +69,7 @@ class OneTargetStudy:
     rows: Mapping[str, Row]
     compared: tuple[str, Callable[[RuleChoice], Row]]
 
-    def sample(self, runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+    def simulate(self, runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
         """Run the rows whose names start with `only`.
 
         Returns
@@ -77,28 +79,27 @@ class OneTargetStudy:
         """
         return self._run(chosen(self.rows, only), runs, seed, progress)
 
-    def _run(self, rows: Mapping[str, Row], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
-        truth, sample = drawn(self.tracking, runs, seed)
-        found: Samples = {TRUTH: np.ascontiguousarray(truth[..., self.quantities[0].axes])}
+    def _run(self, rows: Mapping[str, Row], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
+        draws = drawn(self.tracking, runs, seed)
+        outcomes: Outcomes = {TRUTH: np.ascontiguousarray(draws.truth[..., self.quantities[0].axes])}
         for done, (name, row) in enumerate(rows.items()):
             kept, step = self._empty(name, len(runs)), row.chunk or len(runs)
-            found |= {f"{name}/{key}": array for key, array in kept.items()}
+            outcomes |= {f"{name}/{key}": array for key, array in kept.items()}
             for begin in range(0, len(runs), step):
                 part = slice(begin, min(begin + step, len(runs)))
-                piece = Sample(seed, runs[part], [z[part] for z in sample.seen])
-                for k, fused in enumerate(row.estimates(piece)):
-                    self._keep({key: a[part, k] for key, a in kept.items()}, fused, truth[part, k + 1])
+                for k, fused in enumerate(row.estimates(draws.part(part))):
+                    self._keep({key: a[part, k] for key, a in kept.items()}, fused, draws.truth[part, k + 1])
                     share = (begin + (part.stop - begin) * (k + 1) / self.tracking.steps) / len(runs)
                     progress((done + share) / len(rows))
-        return found
+        return outcomes
 
-    def _empty(self, row: str, runs: int) -> Samples:
+    def _empty(self, row: str, runs: int) -> Outcomes:
         shapes = {q.error: (len(q.axes),) for q in self.quantities} | {CLAIMED: ()}
         if _rule(row) in WEIGHED:
             shapes[WEIGHT] = ()
         return {key: np.empty((runs, self.tracking.steps, *shape)) for key, shape in shapes.items()}
 
-    def _keep(self, into: Samples, fused: FusedTracks, truth: Array) -> None:
+    def _keep(self, into: Outcomes, fused: FusedTracks, truth: Array) -> None:
         """Write what one step gives, (R, ...), into views of what is kept of it."""
         for q in self.quantities:
             into[q.error][...] = (fused.mean - truth)[:, q.axes] * q.factor
@@ -108,7 +109,7 @@ class OneTargetStudy:
             assert fused.weights is not None
             into[WEIGHT][...] = fused.weights[:, 0]
 
-    def compare(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+    def compare(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
         """Root of the time-averaged squared error of each run, (R,), under rules of any family, with feedback.
 
         Raises
@@ -117,55 +118,55 @@ class OneTargetStudy:
         """
         check_needs(rules)
         name, row = self.compared
-        found = self._run({f"{name}-{choice.name}": row(choice) for choice in rules}, runs, seed, progress)
+        outcomes = self._run({f"{name}-{choice.name}": row(choice) for choice in rules}, runs, seed, progress)
         return {
             f"{name}-{choice.name}/{q.name}_rmse_{q.unit}": np.sqrt(
-                _squares(found[f"{name}-{choice.name}/{q.error}"]).mean(1)
+                _squares(outcomes[f"{name}-{choice.name}/{q.error}"]).mean(1)
             )
             for choice in rules
             for q in self.quantities
         }
 
-    def figures(self, samples: Samples) -> dict[str, Estimate]:
+    def figures(self, outcomes: Outcomes) -> dict[str, Estimate]:
         """ARMSE of each quantity; of the position what the covariance claims, and claimed over actual; weights.
 
         Claims are averaged as errors are: the root of the mean variance over runs, averaged over steps. Credibility
         is the claimed variance over the squared error, each averaged over runs and steps: 1 = the truth, below =
         overconfident.
         """
-        found: dict[str, Estimate] = {}
-        for row in _rows(samples):
+        estimates: dict[str, Estimate] = {}
+        for row in _rows(outcomes):
             for q in self.quantities:
-                found[f"{row}/{q.armse}"] = armse(_squares(samples[f"{row}/{q.error}"]))
-            claimed, squares = samples[f"{row}/{CLAIMED}"], self._position_squares(samples, row)
-            found[f"{row}/position_claimed_m"] = armse(claimed)
-            found[f"{row}/position_credibility_1"] = Estimate.ratio(claimed.mean(1), squares.mean(1))
-            if f"{row}/{WEIGHT}" in samples:
-                found |= _weight_figures(row, samples[f"{row}/{WEIGHT}"])
-        return found
+                estimates[f"{row}/{q.armse}"] = armse(_squares(outcomes[f"{row}/{q.error}"]))
+            claimed, squares = outcomes[f"{row}/{CLAIMED}"], self._position_squares(outcomes, row)
+            estimates[f"{row}/position_claimed_m"] = armse(claimed)
+            estimates[f"{row}/position_credibility_1"] = Estimate.ratio(claimed.mean(1), squares.mean(1))
+            if f"{row}/{WEIGHT}" in outcomes:
+                estimates |= _weight_figures(row, outcomes[f"{row}/{WEIGHT}"])
+        return estimates
 
-    def _position_squares(self, samples: Samples, row: str) -> Array:
-        return _squares(samples[f"{row}/{self.quantities[0].error}"])
+    def _position_squares(self, outcomes: Outcomes, row: str) -> Array:
+        return _squares(outcomes[f"{row}/{self.quantities[0].error}"])
 
-    def charts(self, samples: Samples) -> list[Chart]:
+    def charts(self, outcomes: Outcomes) -> list[Chart]:
         """One trial's course, errors and credibility over the steps by filter, and the weight of the average."""
         filters: dict[str, list[str]] = {}
-        for row in _rows(samples):
+        for row in _rows(outcomes):
             if _rule(row) not in NOT_DRAWN:
                 filters.setdefault(row.partition("-")[0], []).append(row)
-        found = [self._course(name, rows, samples) for name, rows in filters.items()]
-        found += [self._errors(name, q, rows, samples) for q in self.quantities for name, rows in filters.items()]
-        found += [self._credibility(name, rows, samples) for name, rows in filters.items()]
-        averages = [row for row in _rows(samples) if _rule(row) == "arithmetic_average"]
-        return found + ([_weights(averages, samples)] if averages else [])
+        charts = [self._course(name, rows, outcomes) for name, rows in filters.items()]
+        charts += [self._errors(name, q, rows, outcomes) for q in self.quantities for name, rows in filters.items()]
+        charts += [self._credibility(name, rows, outcomes) for name, rows in filters.items()]
+        averages = [row for row in _rows(outcomes) if _rule(row) == "arithmetic_average"]
+        return charts + ([_weights(averages, outcomes)] if averages else [])
 
-    def _course(self, name: str, rows: Iterable[str], samples: Samples) -> Chart:
+    def _course(self, name: str, rows: Iterable[str], outcomes: Outcomes) -> Chart:
         """Draw the first run's course by the paper's own rows."""
-        truth = samples[TRUTH][0]
+        truth = outcomes[TRUTH][0]
         lines = [Series("truth", truth[:, 0], truth[:, 1])]
         for row in rows:
             if "@" not in row:
-                estimates = truth[1:] + samples[f"{row}/{self.quantities[0].error}"][0]
+                estimates = truth[1:] + outcomes[f"{row}/{self.quantities[0].error}"][0]
                 lines.append(Series(_rule(row), estimates[:, 0], estimates[:, 1], "dashed"))
         places = [s.location for s in self.tracking.sensors.values() if hasattr(s, "location")]
         if places:
@@ -173,15 +174,15 @@ class OneTargetStudy:
             lines.append(Series("sensors", x, y, "points"))
         return Chart(f"{name.upper()}: course of one trial", "x / m", "y / m", tuple(lines), equal=True)
 
-    def _errors(self, name: str, q: Quantity, rows: Iterable[str], samples: Samples) -> Chart:
-        values = {row: rmse(_squares(samples[f"{row}/{q.error}"])) for row in rows}
+    def _errors(self, name: str, q: Quantity, rows: Iterable[str], outcomes: Outcomes) -> Chart:
+        values = {row: rmse(_squares(outcomes[f"{row}/{q.error}"])) for row in rows}
         what = f"{q.name.replace('_', ' ')} RMSE"
         return _over_steps(f"{name.upper()}: {what}", f"{what} / {q.unit.replace('ps', '/s')}", values)
 
-    def _credibility(self, name: str, rows: Iterable[str], samples: Samples) -> Chart:
+    def _credibility(self, name: str, rows: Iterable[str], outcomes: Outcomes) -> Chart:
         values = {}
         for row in rows:
-            claimed, squares = samples[f"{row}/{CLAIMED}"], self._position_squares(samples, row)
+            claimed, squares = outcomes[f"{row}/{CLAIMED}"], self._position_squares(outcomes, row)
             values[row] = claimed.mean(0) / squares.mean(0)
         title = f"{name.upper()}: claimed over actual position MSE, 1 = credible"
         return dataclasses.replace(_over_steps(title, "claimed / actual", values), log_y=True)
@@ -193,10 +194,10 @@ def _over_steps(title: str, y_label: str, values: Mapping[str, Array]) -> Chart:
     return Chart(title, "step", y_label, lines, log_y=bool(every.max() > LOGARITHMIC_FROM * every.min() > 0.0))
 
 
-def _weights(rows: Iterable[str], samples: Samples) -> Chart:
+def _weights(rows: Iterable[str], outcomes: Outcomes) -> Chart:
     lines = []
     for row in rows:
-        weight = samples[f"{row}/{WEIGHT}"]
+        weight = outcomes[f"{row}/{WEIGHT}"]
         steps = np.arange(1.0, weight.shape[1] + 1)
         lines.append(Series(row.partition("-")[0].upper(), steps, weight.mean(0), error=weight.std(0)))
     return Chart(
@@ -223,6 +224,6 @@ def _rule(row: str) -> str:
     return row.partition("-")[2]
 
 
-def _rows(samples: Samples) -> list[str]:
-    """Names of the rows in samples, in their order."""
-    return list(dict.fromkeys(name.partition("/")[0] for name in samples if name != TRUTH))
+def _rows(outcomes: Outcomes) -> list[str]:
+    """Names of the rows in outcomes, in their order."""
+    return list(dict.fromkeys(name.partition("/")[0] for name in outcomes if name != TRUTH))

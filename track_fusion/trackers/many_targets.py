@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, triu
 
 from track_fusion.association.boxes import points_in_boxes
-from track_fusion.filters import extended
+from track_fusion.filters.base import Gaussian
+from track_fusion.filters.extended import Extended
 from track_fusion.filters.probabilistic_data_association import (
+    Candidate,
     ClutterParams,
-    missed_log_ratio,
-    predict_existence,
-    update,
-    update_existence,
+    ProbabilisticDataAssociation,
+    Scan,
 )
 from track_fusion.linalg import Array, mahalanobis_squared
 from track_fusion.models.base import Motion
@@ -51,22 +51,17 @@ class PdaTrackerParams(ClutterParams):
 
 
 @dataclasses.dataclass(frozen=True)
-class PdaTracks:
-    """What a tracker carries from scan to scan.
+class PdaTracks(Candidate):
+    """What a tracker carries from scan to scan: N candidates.
 
     Attributes
     ----------
-    mean, cov : (N, n), (N, n, n)
-    existence : (N,)             probability that there is a target
     confirmed : (N,) bool        once true, until deletion
     track_id : (N,)              ascending
     leftover : (D, m)            detections of the last scan that no track claimed
     next_id : int
     """
 
-    mean: Array
-    cov: Array
-    existence: Array
     confirmed: NDArray[np.bool_]
     track_id: NDArray[np.int64]
     leftover: Array
@@ -84,6 +79,13 @@ class PdaTracks:
         names = ("mean", "cov", "existence", "confirmed", "track_id")
         return dataclasses.replace(self, **{name: getattr(self, name)[key] for name in names})
 
+    def with_rows(self, at: Indices, rows: Candidate) -> PdaTracks:
+        """Return the tracks with other densities and existence at some rows."""
+        changed = {name: getattr(self, name).copy() for name in ("mean", "cov", "existence")}
+        for name, values in changed.items():
+            values[at] = getattr(rows, name)
+        return dataclasses.replace(self, **changed)
+
 
 class PdaTracker:
     """Tracks every target that one range-bearing sensor sees.
@@ -100,7 +102,7 @@ class PdaTracker:
 
     def __init__(self, motion: Motion, sensor: RangeBearingSensor, frame_id: str, params: PdaTrackerParams) -> None:
         self.motion, self.sensor, self.frame_id, self.params = motion, sensor, frame_id, params
-        self.layout = motion.layout
+        self.layout, self._filter = motion.layout, ProbabilisticDataAssociation(params)
         self._gamma = chi_square_quantile(params.gate_probability, len(sensor.noise))
         self.reset()
 
@@ -125,35 +127,26 @@ class PdaTracker:
         dt_s = 0.0 if self.time_ns < 0 else (time_ns - self.time_ns) / SECOND_NS
         self.time_ns = time_ns
         values = self.sensor.residual(values, np.zeros_like(values))  # bearings wrapped
-        tracks, claimed = self._updated(self._predicted(self.tracks, dt_s), values)
+        tracks, claimed = self._updated(self._filter.predict(self.tracks, self.motion.over(dt_s)), values)
         free = values[~claimed]
         self.tracks = dataclasses.replace(self._begun(tracks, free, dt_s), leftover=free)
         return self._batch(self.tracks[self.tracks.confirmed])
-
-    def _predicted(self, tracks: PdaTracks, dt_s: float) -> PdaTracks:
-        mean, cov = extended.predict(tracks.mean, tracks.cov, self.motion.over(dt_s))
-        return dataclasses.replace(
-            tracks, mean=mean, cov=cov, existence=predict_existence(tracks.existence, self.params)
-        )
 
     def _updated(self, tracks: PdaTracks, values: Array) -> tuple[PdaTracks, NDArray[np.bool_]]:
         """Associate the scan with every track, end and merge tracks; tell also which detections tracks claim."""
         row, col = self._near(tracks.mean, tracks.cov, values)
         used, row = np.unique(row, return_inverse=True)  # the others miss: their states stay
         candidate, present = _padded(row, col, len(used))
-        mean, cov, claimed = tracks.mean.copy(), tracks.cov.copy(), np.zeros(len(values), bool)
-        log_ratio = np.full(len(mean), missed_log_ratio(self.params))
+        claimed, after = np.zeros(len(values), bool), self._filter.missed(tracks)
         if len(used):
-            mean[used], cov[used], found = update(
-                mean[used], cov[used], values[candidate], present, self.sensor, self.params
-            )
-            log_ratio[used] = found.log_ratio
-            claimed[candidate[found.gated & (found.weight[..., :-1] >= CLAIMED)]] = True
-            present = found.gated
-        existence = update_existence(tracks.existence, log_ratio)
-        confirmed = tracks.confirmed | (existence >= self.params.confirmation_existence)
-        tracks = dataclasses.replace(tracks, mean=mean, cov=cov, existence=existence, confirmed=confirmed)
-        stays = existence >= self.params.deletion_existence
+            part, learned = self._filter.update(tracks[used], Scan(values[candidate], present), self.sensor)
+            after = after.with_rows(used, part)
+            claimed[candidate[learned.gated & (learned.weight[..., :-1] >= CLAIMED)]] = True
+            present = learned.gated
+        tracks = dataclasses.replace(
+            after, confirmed=tracks.confirmed | (after.existence >= self.params.confirmation_existence)
+        )
+        stays = tracks.existence >= self.params.deletion_existence
         track, place = np.nonzero(present & stays[used, None])
         stays[self._doubled(tracks, used[track], candidate[track, place])] = False
         return tracks[stays], claimed
@@ -189,11 +182,11 @@ class PdaTracker:
         at, rate = np.array(layout.position), np.array(layout.velocity)
         mean[:, at], cov[:, at[:, None], at] = first, first_cov
         cov[:, rate, rate] = self.params.speed_sd**2
-        mean, cov = extended.predict(mean, cov, self.motion.over(dt_s))
-        row, col = self._near(mean, cov, free)
-        mean, cov, found = extended.update(mean[row], cov[row], free[col], self.sensor)
-        gated = found.nis <= self._gamma
-        mean, cov = mean[gated], cov[gated]
+        start = Extended().predict(Gaussian(mean, cov), self.motion.over(dt_s))
+        row, col = self._near(start.mean, start.cov, free)
+        begun, learned = Extended().update(Gaussian(start.mean[row], start.cov[row]), free[col], self.sensor)
+        gated = learned.nis <= self._gamma
+        mean, cov = begun.mean[gated], begun.cov[gated]
         count = len(mean)
         return PdaTracks(
             np.concatenate([tracks.mean, mean]),

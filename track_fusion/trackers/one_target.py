@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
+from track_fusion.densities.log_domain import log_of
+from track_fusion.filters.base import Density, Gaussian, TrackState
+from track_fusion.filters.particle import Particles
 from track_fusion.linalg import Array, is_well_conditioned, mahalanobis_squared, transpose
 from track_fusion.models.base import Motion, Sensor
 from track_fusion.models.choices import SENSORS, MotionChoice, square_matrix
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.params import ParameterError, Params, param
-from track_fusion.trackers.filters import TRACK_FILTERS, TrackFilter
+from track_fusion.trackers.filters import FILTERS, OneTargetFilter
 from track_fusion.tracks import COASTED, CONFIRMED, SECOND_NS, StateLayout, TrackBatch
 
-#: The tracker of any number of targets in clutter, pda_tracker.py.
+#: The tracker of any number of targets in clutter, many_targets.py.
 MULTI_TARGET = "pda"
 
 
@@ -31,7 +35,7 @@ class TrackerChoice(MotionChoice):
     filter: str = param(
         "kalman",
         "the filter of the one target; or pda: any number of targets in clutter, by probabilistic data association",
-        choices=(*TRACK_FILTERS, MULTI_TARGET),
+        choices=(*FILTERS, MULTI_TARGET),
     )
 
 
@@ -76,18 +80,9 @@ class _OfDetection:
     sensor: Sensor
     noise: Array
 
-    @property
-    def axes(self) -> tuple[str, ...]:
-        return self.sensor.axes
-
-    def observe(self, state: Array) -> Array:
-        return self.sensor.observe(state)
-
-    def jacobian(self, state: Array) -> Array:
-        return self.sensor.jacobian(state)
-
-    def residual(self, z: Array, expected: Array) -> Array:
-        return self.sensor.residual(z, expected)
+    def __getattr__(self, name: str) -> Any:
+        """All else is the sensor's."""
+        return getattr(self.sensor, name)
 
 
 class SensorTracker:
@@ -97,7 +92,7 @@ class SensorTracker:
     ----------
     motion : Motion           its layout is the tracker's
     sensor : Sensor           of that layout
-    track_filter : TrackFilter
+    track_filter : OneTargetFilter
     frame_id : str
     params : SensorTrackerParams
 
@@ -108,7 +103,7 @@ class SensorTracker:
     """
 
     def __init__(
-        self, motion: Motion, sensor: Sensor, track_filter: TrackFilter, frame_id: str, params: SensorTrackerParams
+        self, motion: Motion, sensor: Sensor, track_filter: OneTargetFilter, frame_id: str, params: SensorTrackerParams
     ) -> None:
         self.motion, self.sensor, self.filter = motion, sensor, track_filter
         self.layout, self.frame_id, self.params = motion.layout, frame_id, params
@@ -123,30 +118,39 @@ class SensorTracker:
 
     def reset(self) -> None:
         """Go back to the initial state."""
-        self._track = self._initial() if self.params.initial_mean else None
-        self._provenance = np.uint32(0)
+        self._state: TrackState | None = None
+        self._time_ns, self._provenance = -1, np.uint32(0)
+        if self.params.initial_mean:
+            self._begin_given()
 
-    def _initial(self) -> TrackBatch:
+    def _begin_given(self) -> None:
         n, mean = self.layout.size, np.array(self.params.initial_mean)
         if mean.shape != (n,):
             raise ParameterError(f"The 'initial_mean' parameter must hold {n} numbers, one an axis. Got {len(mean)}.")
         square = square_matrix("initial_cov", self.params.initial_cov, n)
         try:
-            return self._begun(mean, square, round(self.params.initial_stamp_s * SECOND_NS))
+            self._begin(mean, square, round(self.params.initial_stamp_s * SECOND_NS))
         except ValueError as error:
             raise ParameterError(f"The 'initial_cov' parameter does not fit: {error}") from None
 
-    def _begun(self, mean: Array, cov: Array, time_ns: int) -> TrackBatch:
-        track = TrackBatch.gaussian(
-            self.layout, self.frame_id, mean[None], cov[None],
-            time_ns=time_ns, track_id=np.array([self.params.track_id]), status=CONFIRMED,
+    def _begin(self, mean: Array, cov: Array, time_ns: int) -> None:
+        """Begin a track, if it is one: else a ValueError."""
+        self._blank = TrackBatch.gaussian(
+            self.layout, self.frame_id, mean[None], cov[None], track_id=np.array([self.params.track_id])
+        )
+        self._state, self._time_ns = self.filter.begin(self._blank.mean[0, 0], self._blank.cov[0, 0]), time_ns
+
+    def _shown(self, state: TrackState, time_ns: int, status: int = CONFIRMED) -> TrackBatch:
+        parts = state.components
+        return self._blank.replace(
+            weight=parts.weight[None], mean=parts.mean[None], cov=parts.cov[None], dof=np.array([state.dof]),
+            time_ns=np.array([time_ns]), status=np.array([status], np.uint8), source=np.array([self._provenance]),
         )  # fmt: skip
-        return self.filter.begin(track)
 
     @property
     def time_ns(self) -> int:
         """Time of the current state; -1 before there is one."""
-        return -1 if self._track is None else int(self._track.time_ns[0])
+        return self._time_ns
 
     def step(self, time_ns: int, values: Array, covs: Array | None) -> TrackBatch:
         """Predict to a scan and update with its detection.
@@ -166,40 +170,35 @@ class SensorTracker:
         LostTrackError    a detection far off or of a wild covariance was too much for the numbers; the tracker goes on
                           with the next scan
         """
-        if self._track is None:
-            self._track = self._started(time_ns, values, covs)
-            return self._track if self._track is not None else TrackBatch.empty(self.layout, self.frame_id)
+        if self._state is None:
+            return self._started(time_ns, values, covs)
         try:
-            track = self._updated(self._track, time_ns, values, covs)
+            state = self._updated(self._state, (time_ns - self._time_ns) / SECOND_NS, values, covs)
+            track = self._shown(state, time_ns, CONFIRMED if len(values) else CONFIRMED | COASTED)
             faults = ", ".join(track.faults)
         except np.linalg.LinAlgError as error:
             faults = str(error)
         if faults:
             self.reset()
             if _sees_position(self.sensor, self.layout):
-                self._track = None  # a detection tells more than a state of long ago
+                self._state, self._time_ns = None, -1  # a detection tells more than a state of long ago
             raise LostTrackError("lost_track", f"The state is no density any more ({faults}): the track starts anew.")
-        self._track = track
+        self._state, self._time_ns = state, time_ns
         return track
 
-    def _updated(self, track: TrackBatch, time_ns: int, values: Array, covs: Array | None) -> TrackBatch:
-        track = self.filter.predict(track, self.motion.over((time_ns - self.time_ns) / SECOND_NS))
-        if len(values):
-            noises = (
-                np.broadcast_to(self.sensor.noise, (len(values), *self.sensor.noise.shape)) if covs is None else covs
-            )
-            at = self._nearest(track, values, noises) if len(values) > 1 else 0
-            sensor = self.sensor if covs is None else _OfDetection(self.sensor, noises[at])
-            track = self.filter.update(track, values[at], sensor)
-        return track.replace(
-            time_ns=np.array([time_ns]),
-            status=np.array([CONFIRMED if len(values) else CONFIRMED | COASTED], np.uint8),
-            source=np.array([self._provenance]),
-        )
-
-    def _started(self, time_ns: int, values: Array, covs: Array | None) -> TrackBatch | None:
+    def _updated(self, state: TrackState, dt_s: float, values: Array, covs: Array | None) -> TrackState:
+        state = self.filter.predict(state, self.motion.over(dt_s))
         if not len(values):
-            return None
+            return state
+        noises = np.broadcast_to(self.sensor.noise, (len(values), *self.sensor.noise.shape)) if covs is None else covs
+        at = self._nearest(state, values, noises) if len(values) > 1 else 0
+        sensor = self.sensor if covs is None else _OfDetection(self.sensor, noises[at])
+        updated: TrackState = self.filter.update(state, values[at], sensor)[0]
+        return updated
+
+    def _started(self, time_ns: int, values: Array, covs: Array | None) -> TrackBatch:
+        if not len(values):
+            return TrackBatch.empty(self.layout, self.frame_id)
         noise = self.sensor.noise if covs is None else covs[0]
         mean, cov = np.zeros(self.layout.size), self.params.initial_turn_rate_sd**2 * np.eye(self.layout.size)
         cov[self.layout.velocity, self.layout.velocity] = self.params.initial_speed_sd**2
@@ -207,12 +206,14 @@ class SensorTracker:
         if not is_well_conditioned(cov):
             raise LostTrackError("cannot_start", "No track can start from the detection: it does not tell a position.")
         try:
-            return self._begun(mean, cov, time_ns)
+            self._begin(mean, cov, time_ns)
         except ValueError as error:
             raise LostTrackError("cannot_start", f"No track can start from the detection: {error}") from None
+        assert self._state is not None
+        return self._shown(self._state, time_ns)
 
-    def _nearest(self, track: TrackBatch, values: Array, noises: Array) -> int:
-        (mean,), (cov,) = track.moments
+    def _nearest(self, state: Density, values: Array, noises: Array) -> int:
+        mean, cov = state.moments
         slope = self.sensor.jacobian(mean)
         residual = self.sensor.residual(values, self.sensor.observe(mean))
         return int(np.argmin(mahalanobis_squared(residual, slope @ cov @ transpose(slope) + noises)))
@@ -222,16 +223,24 @@ class SensorTracker:
 
         Of several fused tracks the statistically nearest is taken; the filter brings it into its own form.
         """
-        if self._track is None or not len(fused) or int(fused.time_ns[0]) != self.time_ns:
+        if self._state is None or not len(fused) or int(fused.time_ns[0]) != self._time_ns:
             return False
         fused, at = fused.to_axes(self.layout), 0
         if len(fused) > 1:
-            (own_mean,), (own_cov,) = self._track.moments
+            own_mean, own_cov = self._state.moments
             mean, cov = fused.moments
             at = int(np.argmin(mahalanobis_squared(mean - own_mean, cov + own_cov)))
         self._provenance |= fused.source[at]
-        self._track = self.filter.adopt(self._track, fused[at : at + 1])
+        self._state = self.filter.adopt(self._state, _density(fused[at : at + 1]))
         return True
+
+
+def _density(track: TrackBatch) -> Density:
+    """Return a track as its particles if it consists of them, else as its merged Gaussian."""
+    if track.components > 1 and not track.cov.any():
+        return Particles(track.mean[0], log_of(track.weight[0]))
+    (mean,), (cov,) = track.moments
+    return Gaussian(mean, cov)
 
 
 def _sees_position(sensor: Sensor, layout: StateLayout) -> bool:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,13 +46,12 @@ def bound_weights(mean: Array, cov: Array) -> Solution:
         values = np.maximum(values, np.maximum(FLAT * values.max(1, keepdims=True), np.finfo(float).tiny))
         return gradient, (vectors * values[:, None, :]) @ transpose(vectors)
 
-    found = minimise_on_simplex(gradient_hessian, len(several), count, np.repeat(starts, batch, 0))
-    values = (found.weights * np.log(np.einsum("bij,bj->bi", several, found.weights))).sum(1)
+    ends = minimise_on_simplex(gradient_hessian, len(several), count, np.repeat(starts, batch, 0))
+    values = (ends.weights * np.log(np.einsum("bij,bj->bi", several, ends.weights))).sum(1)
     # Of equal minima the one from the centre: of equal tracks all weigh the same.
-    values = np.round(np.where(found.converged, values, np.inf), 12).reshape(len(starts), batch)
+    values = np.round(np.where(ends.converged, values, np.inf), 12).reshape(len(starts), batch)
     best = values.argmin(0) if batch else np.zeros(0, np.intp)
-    pick = {f.name: getattr(found, f.name) for f in dataclasses.fields(Solution)}
-    return Solution(**{k: v.reshape(len(starts), batch, *v.shape[1:])[best, np.arange(batch)] for k, v in pick.items()})
+    return ends[best * batch + np.arange(batch)]
 
 
 def _overlap(mean: Array, cov: Array) -> Array:

@@ -39,7 +39,7 @@ def merging_weights(mean: Array, cov: Array, linear: Array | None = None) -> Sol
     Solution    weights (B, K); uniform where all tracks are equal
     """
     if mean.shape[1] == 1:
-        return Solution(np.ones(mean.shape[:2]), np.ones(len(mean), bool), np.zeros(len(mean), np.intp))
+        return Solution.known(np.ones(mean.shape[:2]))
     if mean.shape[1] > 2:
         return minimise_on_simplex(_gradient_hessian(mean, cov, linear), len(mean), mean.shape[1])
     slope = None if linear is None else linear[:, 0] - linear[:, 1]
@@ -48,8 +48,7 @@ def merging_weights(mean: Array, cov: Array, linear: Array | None = None) -> Sol
         return Solution.concatenate([_single(*parts) for parts in zip(mean, cov, slopes, strict=True)])
     pair = Pair.of(cov[:, 0], cov[:, 1])
     difference = pair.coordinates(mean[:, 0] - mean[:, 1])
-    found = minimise_on_interval(pair_derivatives(pair, difference, slope), len(mean))
-    return Solution(np.stack([found.weights, 1.0 - found.weights], -1), found.converged, found.iterations)
+    return minimise_on_interval(pair_derivatives(pair, difference, slope), len(mean)).of_both()
 
 
 def pair_derivatives(pair: Pair, difference: Array, slope: Array | None) -> Derivatives:
@@ -86,8 +85,7 @@ def _single(mean: Array, cov: Array, slope: float | None) -> Solution:
     if pair is None:
         two = Pair.of(cov[:1], cov[1:])
         given = None if slope is None else np.array([slope])
-        found = minimise_on_interval(pair_derivatives(two, two.coordinates(mean[:1] - mean[1:]), given), 1)
-        return Solution(np.stack([found.weights, 1.0 - found.weights], -1), found.converged, found.iterations)
+        return minimise_on_interval(pair_derivatives(two, two.coordinates(mean[:1] - mean[1:]), given), 1).of_both()
     square = ((pair.inverse @ (mean[0] - mean[1])) ** 2).tolist()
     axes = [(q, -c, e) for q, c, e in zip(pair.second, pair.contrast, square, strict=True)]
     start = sum(math.log((q + c) / q) for q, c, _ in axes) if slope is None else slope

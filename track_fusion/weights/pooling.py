@@ -48,11 +48,10 @@ def _pooling_weights(mean: Array, cov: Array, naive: bool) -> Solution:
     """
     batch, count = mean.shape[:2]
     if count == 1:
-        return Solution(np.ones((batch, 1)), np.ones(batch, bool), np.zeros(batch, np.intp))
+        return Solution.known(np.ones((batch, 1)))
     if count > 2:
         return minimise_on_simplex(_gradient_hessian(mean, cov, naive), batch, count)
-    found = minimise_on_interval(_pair_derivatives(mean, cov, naive), batch)
-    return Solution(np.stack([found.weights, 1.0 - found.weights], -1), found.converged, found.iterations)
+    return minimise_on_interval(_pair_derivatives(mean, cov, naive), batch).of_both()
 
 
 def _pair_derivatives(mean: Array, cov: Array, naive: bool) -> Derivatives:

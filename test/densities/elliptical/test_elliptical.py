@@ -11,12 +11,10 @@ from scipy.stats import multivariate_normal, multivariate_t
 
 from track_fusion.densities.elliptical.elliptical import (
     Family,
-    from_generator,
     gaussian,
     generalized_gaussian,
     student_t,
 )
-from track_fusion.linalg import Array
 
 FAMILIES = {
     "t3": lambda m: student_t(3.0, m),
@@ -66,41 +64,6 @@ def test_constants_are_the_expectations_of_eq_9(make: object, axes: int) -> None
         assert family.kappa == pytest.approx(_radial(family, 1.0, False) / axes, rel=1e-5)
 
 
-@EVERY_FAMILY
-@pytest.mark.parametrize("axes", [1, 2, 6])
-def test_quadrature_of_any_generating_function(make: object, axes: int) -> None:
-    """The closed forms and the quadrature come from different sides; an unnormalised h is normalised."""
-    family = make(axes)  # type: ignore[operator]
-    found = from_generator(lambda u: family.log_generator(u) + 3.0, axes)
-    u = np.array([0.0, 0.3, 2.0, 50.0])
-    np.testing.assert_allclose([found.a, found.b, found.kappa], [family.a, family.b, family.kappa], rtol=1e-10)
-    np.testing.assert_allclose(found.log_generator(u), family.log_generator(u), atol=1e-9)
-
-
-def test_quadrature_with_a_slope_and_of_a_mixture_of_scales() -> None:
-    """A contaminated Gaussian has no closed form; its moments and information do have Monte Carlo estimates."""
-    share, wide, axes = 0.1, 9.0, 2
-
-    def log_h(u: Array) -> Array:
-        return np.logaddexp(math.log(1 - share) - 0.5 * u, math.log(share / wide ** (axes / 2)) - 0.5 * u / wide)
-
-    def slope(u: Array) -> Array:
-        first, second = (1 - share) * np.exp(-0.5 * u), share / wide ** (axes / 2) * np.exp(-0.5 * u / wide)
-        ratio = np.divide(first, first + second, out=np.zeros_like(u), where=first + second > 0)
-        return -0.5 * u * (ratio + (1.0 - ratio) / wide)
-
-    family = from_generator(log_h, axes)
-    exact = from_generator(log_h, axes, slope)
-    np.testing.assert_allclose([family.a, family.b], [exact.a, exact.b], rtol=1e-9)
-    assert family.kappa == pytest.approx(1 - share + share * wide, rel=1e-12)
-    rng = np.random.default_rng(3)
-    z = rng.normal(size=(400_000, axes)) * np.where(rng.uniform(size=(400_000, 1)) < share, math.sqrt(wide), 1.0)
-    u = (z**2).sum(1)
-    xi = slope(u) / u
-    for got, sample in ((family.a, xi**2 * u / axes), (family.b, xi**2 * u**2 / (axes * (axes + 2)))):
-        assert abs(got - sample.mean()) < 4.0 * sample.std() / math.sqrt(len(u))
-
-
 def test_dof_to_infinity_is_the_gaussian() -> None:
     for axes in (1, 3, 6):
         limit, normal = student_t(1e12, axes), gaussian(axes)
@@ -133,5 +96,3 @@ def test_families_that_do_not_exist() -> None:
         student_t(np.array([3.0, 2.0]), 2)
     with pytest.raises(ValueError, match=r"The 'beta' of a generalised .* 1 axes must exceed 0\.25\. Got 0\.2"):
         generalized_gaussian(0.2, 1)
-    with pytest.raises(ValueError, match="must have a covariance"):
-        from_generator(lambda u: -1.5 * np.log1p(u), 1)  # Student-t of two degrees of freedom

@@ -7,21 +7,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from densities.elliptical import distances
 from rules.examples import covariances
 from scipy.integrate import quad
 from scipy.optimize import minimize, minimize_scalar
 
 from track_fusion.densities.elliptical.elliptical import Family, gaussian, generalized_gaussian, student_t
-from track_fusion.densities.elliptical.rao import (
-    geodesic_projection_distance,
-    informative_barycenter,
-    minimal_manhattan_distance,
-    projection_distance,
-    rao_distance_same_mean,
-    rao_distance_same_shape,
-    rao_distance_scalar,
-    scalar_geodesic,
-)
+from track_fusion.densities.elliptical.rao import informative_barycenter, rao_distance_scalar, scalar_geodesic
 from track_fusion.linalg import Array
 
 SCALAR = [student_t(3.0, 1), generalized_gaussian(0.65, 1), gaussian(1)]
@@ -118,13 +110,13 @@ def test_distance_at_one_mean() -> None:
     for family in PLANE:
         logs = np.log(np.linalg.eigvals(np.linalg.solve(first, second)))
         wanted = math.sqrt(2 * family.b * (logs**2).sum() + (family.b - 0.25) * logs.sum() ** 2)
-        assert rao_distance_same_mean(family, first, second) == pytest.approx(wanted, rel=1e-10)
+        assert distances.same_mean(family, first, second) == pytest.approx(wanted, rel=1e-10)
 
 
 def test_distance_at_one_shape_in_one_axis_is_the_scalar_distance() -> None:
     for family in SCALAR:
         for m, s, other, scale in ((0.0, 2.0, 1.5, 1.0), (0.0, 2.0, 20.0, 0.1), (1.0, 3.0, 1.0, 4.0)):
-            got = rao_distance_same_shape(family, np.array([m]), np.array([[s]]), np.array([other]), np.asarray(scale))
+            got = distances.same_shape(family, np.array([m]), np.array([[s]]), np.array([other]), np.asarray(scale))
             wanted = rao_distance_scalar(family, *(np.asarray(v) for v in (m, s, other, scale * s)))
             assert got == pytest.approx(float(wanted), rel=1e-12)
 
@@ -134,10 +126,10 @@ def test_projection_distance_is_the_least_at_one_shape() -> None:
     scatter, mean, other = covariances(rng, n=2), rng.normal(size=2), 6.0 * rng.normal(size=2)
     for family in PLANE:
         best = minimize_scalar(
-            lambda u, f=family: float(rao_distance_same_shape(f, mean, scatter, other, np.exp(u))),
+            lambda u, f=family: float(distances.same_shape(f, mean, scatter, other, np.exp(u))),
             bounds=(-5, 5), method="bounded", options={"xatol": 1e-10},
         )  # fmt: skip
-        distance, scale = projection_distance(family, mean, scatter, other)
+        distance, scale = distances.projection(family, mean, scatter, other)
         assert distance == pytest.approx(best.fun, rel=1e-10)
         assert math.log(scale) == pytest.approx(best.x, abs=1e-4)
 
@@ -163,7 +155,7 @@ def _path_length(family: Family, knots: Array) -> float:
 def test_geodesic_projection_against_a_search_over_paths(family: Family) -> None:
     """No path through the whole manifold to another mean is shorter, and one comes as near as its corners allow."""
     corners, other = 12, np.array([2.5, 0.0])
-    wanted = float(geodesic_projection_distance(family, np.zeros(2), np.eye(2), other))
+    wanted = float(distances.geodesic_projection(family, np.zeros(2), np.eye(2), other))
     share = np.linspace(0.0, 1.0, corners + 1)[1:]
 
     def length(v: Array) -> float:
@@ -177,7 +169,7 @@ def test_geodesic_projection_against_a_search_over_paths(family: Family) -> None
     found = minimize(length, start, method="BFGS", options={"maxiter": 60}).fun
     assert wanted <= found * (1 + 2e-3)  # the midpoint rule errs by the square of a step
     assert found <= wanted * 1.01
-    distance, _ = projection_distance(family, np.zeros(2), np.eye(2), other)
+    distance, _ = distances.projection(family, np.zeros(2), np.eye(2), other)
     assert wanted < distance
 
 
@@ -192,11 +184,11 @@ def test_minimal_manhattan_distance_against_a_search() -> None:
 
             def path(u: float, family: Family = family, m: Array = mean, o: Array = other, p: Array = first,
                      q: Array = second) -> float:  # fmt: skip
-                along = rao_distance_same_shape(family, m, p, o, np.exp(u))
-                return float(along + rao_distance_same_mean(family, np.exp(u) * p, q))
+                along = distances.same_shape(family, m, p, o, np.exp(u))
+                return float(along + distances.same_mean(family, np.exp(u) * p, q))
 
             best = minimize_scalar(path, bounds=(-6, 8), method="bounded", options={"xatol": 1e-10})
-            got = float(minimal_manhattan_distance(family, mean, first, other, second))
+            got = float(distances.minimal_manhattan(family, mean, first, other, second))
             assert got == pytest.approx(best.fun, rel=1e-9)
 
 
@@ -206,11 +198,11 @@ def test_minimal_manhattan_distance_in_one_axis_is_exact() -> None:
     scatter, wide = np.exp(rng.normal(size=(2, 40)))
     mean[:3], scatter[5:8] = other[:3], wide[5:8]
     for family in SCALAR:
-        got = minimal_manhattan_distance(
+        got = distances.minimal_manhattan(
             family, mean[:, None], scatter[:, None, None], other[:, None], wide[:, None, None]
         )
         np.testing.assert_allclose(got, rao_distance_scalar(family, mean, scatter, other, wide), rtol=1e-9)
-    assert minimal_manhattan_distance(gaussian(2), np.ones(2), np.eye(2), np.ones(2), np.eye(2)) == 0.0
+    assert distances.minimal_manhattan(gaussian(2), np.ones(2), np.eye(2), np.ones(2), np.eye(2)) == 0.0
 
 
 def test_distances_that_are_tiny_keep_their_digits() -> None:

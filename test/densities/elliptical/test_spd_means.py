@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from oracles.exact import exact, mp
 from rules.examples import covariances, rotated
-from rules.oracles import exact, mp
 
 from track_fusion.densities.elliptical.spd_means import karcher_mean, log_euclidean_mean
 from track_fusion.linalg import Array

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from densities.mixture.examples import draw
+from oracles.mixtures import by_scipy
 from scipy import integrate
 from scipy.stats import multivariate_normal
 
@@ -11,22 +13,6 @@ from track_fusion.densities.log_domain import effective_sample_size, log_mean_ex
 from track_fusion.densities.mixture import mixture as mixtures
 from track_fusion.densities.mixture.algebra import LogMixture, gaussian_quotient, power, product
 from track_fusion.densities.mixture.mixture import Factored, Mixture
-from track_fusion.linalg import Array
-
-
-def draw(rng: np.random.Generator, *lead: int, count: int = 3, n: int = 2, spread: float = 3.0) -> Mixture:
-    root = rng.normal(size=(*lead, count, n, n + 2))
-    weight = rng.uniform(0.2, 1.0, size=(*lead, count))
-    return Mixture(
-        weight / weight.sum(-1, keepdims=True),
-        spread * rng.normal(size=(*lead, count, n)),
-        root @ np.swapaxes(root, -1, -2),
-    )
-
-
-def by_scipy(mixture: Mixture, points: Array) -> Array:
-    parts = zip(mixture.weight, mixture.mean, mixture.cov, strict=True)
-    return np.log(sum(w * multivariate_normal.pdf(points, m, c) for w, m, c in parts))
 
 
 def test_log_pdf_is_that_of_scipy_with_and_without_a_batch() -> None:

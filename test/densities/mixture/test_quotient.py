@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from densities.mixture.test_mixture import draw
+from densities.mixture.examples import COMMON, FIRST, SECOND, draw, mixand_moments, scalar
 from scipy.optimize import minimize
 
 from track_fusion.densities.mixture.algebra import LogMixture
-from track_fusion.densities.mixture.divergence import grid
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments
 from track_fusion.densities.mixture.quotient import (
     Quotient,
@@ -21,27 +20,6 @@ from track_fusion.densities.mixture.quotient import (
     wep_quotient,
 )
 from track_fusion.linalg import Array
-
-
-def _scalar(*parts: tuple[float, float, float]) -> Mixture:
-    weight, mean, cov = np.array(parts).T
-    return Mixture(weight, mean[:, None], cov[:, None, None])
-
-
-FIRST = _scalar((0.4, -1.0, 1.0), (0.6, 2.0, 2.0))
-SECOND = _scalar((0.7, 0.0, 1.5), (0.3, 4.0, 1.0))
-COMMON = _scalar((0.5, -2.0, 6.0), (0.5, 3.0, 4.0))
-
-
-def mixand_moments(quotient: Quotient, z: int) -> tuple[float, float, float]:
-    """Integral, mean and variance of one scalar mixand, its weight included, by the midpoint rule on a fine grid."""
-    one = quotient.take(np.array([z]))
-    weight, mean, cov = one.numerator
-    points = grid(np.array([-80.0]), np.array([80.0]), 8000)
-    density = np.exp(weight[0] + log_pdf(Mixture(np.ones(1), mean, cov), points) - quotient.log_denominator(points))
-    total, x = density.sum() * 160.0 / 8000, points[:, 0]
-    centre = density @ x / density.sum()
-    return float(total), float(centre), float(density @ (x - centre) ** 2 / density.sum())
 
 
 @pytest.mark.parametrize("z", range(4))
@@ -127,7 +105,7 @@ def test_laplace_is_exact_for_single_gaussians_and_so_is_the_moment_matched_deno
 def test_laplace_of_a_saddle_falls_back_to_the_numerator() -> None:
     """Dividing by a sharp bump at the numerator's mean: two modes, and at the start a minimum."""
     quotient = exact_quotient(
-        _scalar((1.0, 0.0, 2.0)), _scalar((1.0, 0.0, 2.0)), _scalar((0.9, 0.0, 0.2), (0.1, 0.0, 50.0))
+        scalar((1.0, 0.0, 2.0)), scalar((1.0, 0.0, 2.0)), scalar((0.9, 0.0, 0.2), (0.1, 0.0, 50.0))
     )
     found = laplace(quotient)
     assert np.isfinite(found.log_moment).all()

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from densities.mixture.test_mixture import draw
-from densities.mixture.test_quotient import COMMON, FIRST, SECOND, mixand_moments
+from densities.mixture.examples import COMMON, FIRST, SECOND, draw, mixand_moments
 from scipy import integrate
 from scipy.optimize import minimize_scalar
 
-from track_fusion.densities.mixture.divergence import grid, kl_on_grid, moments_on_grid
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments, sample
 from track_fusion.densities.mixture.proposals import (
     Proposal,
@@ -29,6 +27,7 @@ from track_fusion.densities.mixture.sampling import (
     single_shot_em,
     weighted_em,
 )
+from track_fusion.densities.on_grid import grid, kl_on_grid, moments_on_grid
 from track_fusion.linalg import Array
 
 POINTS = grid(np.array([-40.0]), np.array([40.0]), 4000)
@@ -62,7 +61,7 @@ def test_omega_is_that_of_quadrature(criterion: str) -> None:
     w = float(found.omega)
     wanted = np.log(_integral(w * _log(FIRST) + (1 - w) * _log(SECOND)))
     assert found.samples.log_eta == pytest.approx(wanted, abs=0.01)
-    mean, cov = moments_on_grid(lambda x: w * log_pdf(FIRST, x) + (1 - w) * log_pdf(SECOND, x), POINTS)
+    mean, cov = moments_on_grid(w * log_pdf(FIRST, POINTS) + (1 - w) * log_pdf(SECOND, POINTS), POINTS)
     got = found.samples.moments()
     assert got[0][0] == pytest.approx(mean[0], abs=4 * np.sqrt(cov[0, 0] / float(found.samples.ess)))
     assert got[1][0, 0] == pytest.approx(cov[0, 0], rel=0.05)
@@ -71,11 +70,8 @@ def test_omega_is_that_of_quadrature(criterion: str) -> None:
 def test_chernoff_point_is_equally_far_from_both() -> None:
     """Ahmed (10), which the paper gives as necessary and sufficient."""
     w = float(optimise_omega(FIRST, SECOND, np.random.default_rng(0), 40000).omega)
-
-    def fused(x: Array) -> Array:
-        return w * log_pdf(FIRST, x) + (1 - w) * log_pdf(SECOND, x)
-
-    far = [kl_on_grid(fused, lambda x, m=m: log_pdf(m, x), POINTS) for m in (FIRST, SECOND)]
+    logs = log_pdf(FIRST, POINTS), log_pdf(SECOND, POINTS)
+    far = [kl_on_grid(w * logs[0] + (1 - w) * logs[1], log) for log in logs]
     assert far[0] == pytest.approx(far[1], rel=0.2)
 
 
@@ -120,7 +116,7 @@ def test_weighted_em_does_not_depend_on_the_batch() -> None:
 
 def test_single_shot_em_keeps_the_moments_of_the_samples() -> None:
     quotient = exact_quotient(FIRST, SECOND, COMMON)
-    proposal = laplace_proposal(quotient)
+    proposal = laplace_proposal(laplace(quotient))
     drawn = indirect_global_sampling(quotient, proposal, np.random.default_rng(0), 500, floor=0.0)
     for got, wanted in zip(moments(drawn.mixture), drawn.samples.moments(), strict=True):
         np.testing.assert_allclose(got, wanted, rtol=1e-10)
@@ -141,7 +137,7 @@ def test_single_shot_em_survives_mixands_without_samples() -> None:
 def test_igs_and_its_proposal_against_quadrature() -> None:
     quotient = exact_quotient(FIRST, SECOND, COMMON)
     wanted = [mixand_moments(quotient, z) for z in range(4)]
-    found = indirect_global_sampling(quotient, laplace_proposal(quotient), np.random.default_rng(0), 40000)
+    found = indirect_global_sampling(quotient, laplace_proposal(laplace(quotient)), np.random.default_rng(0), 40000)
     total = sum(w[0] for w in wanted)
     assert found.samples.log_eta == pytest.approx(np.log(total), abs=0.02)
     for z, (mass, mean, variance) in enumerate(wanted):
@@ -179,7 +175,7 @@ def test_dls_of_a_weighted_exponential_product_against_quadrature() -> None:
     found = direct_local_sampling(quotient, inflated_naive(quotient, FIRST, SECOND), np.random.default_rng(0), 20000)
     a, b = _log(FIRST), _log(SECOND)
     assert found.log_eta == pytest.approx(np.log(_integral(0.35 * a + 0.65 * b)), abs=0.02)
-    mean, cov = moments_on_grid(lambda x: 0.35 * log_pdf(FIRST, x) + 0.65 * log_pdf(SECOND, x), POINTS)
+    mean, cov = moments_on_grid(0.35 * log_pdf(FIRST, POINTS) + 0.65 * log_pdf(SECOND, POINTS), POINTS)
     got = moments(found.mixture)
     assert got[0][0] == pytest.approx(mean[0], abs=0.05)
     assert got[1][0, 0] == pytest.approx(cov[0, 0], rel=0.05)

@@ -1,16 +1,15 @@
-"""Divergences, reduction and extraction of Gaussian mixtures: closed forms, quadrature, a naive oracle, laws."""
+"""Densities on a grid and reduction of Gaussian mixtures: quadrature, a naive oracle, laws."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from densities.mixture.test_mixture import draw
+from densities.mixture.examples import draw
 from scipy import integrate
-from scipy.optimize import minimize
 
-from track_fusion.densities.gaussian import kl_divergence
-from track_fusion.densities.mixture import divergence, extraction, reduction
-from track_fusion.densities.mixture.mixture import Factored, Mixture, log_pdf, moments
+from track_fusion.densities.mixture import reduction
+from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments
+from track_fusion.densities.on_grid import grid, kl_on_grid, moments_on_grid
 from track_fusion.linalg import Array
 
 
@@ -23,41 +22,21 @@ def _kl_by_quadrature(first: Mixture, second: Mixture) -> float:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_kl_of_mixtures_lies_between_its_bounds_and_all_ways_agree(seed: int) -> None:
+def test_kl_of_mixtures_on_a_grid_is_that_by_quadrature(seed: int) -> None:
     rng = np.random.default_rng(seed)
     first, second = draw(rng, count=2, n=1, spread=1.0), draw(rng, count=3, n=1, spread=1.0)
     wanted = _kl_by_quadrature(first, second)
-    lower, upper = divergence.kl_bounds(first, second)
-    assert lower < wanted < upper
-    points = divergence.grid(np.array([-40.0]), np.array([40.0]), 8000)
-    on_grid = divergence.kl_on_grid(lambda x: log_pdf(first, x), lambda x: log_pdf(second, x), points)
-    assert on_grid == pytest.approx(wanted, rel=1e-6)
-    sampled = divergence.kl_monte_carlo(first, second, rng, 20000)
-    assert abs(sampled.value - wanted) < 4 * sampled.error < 0.2 + wanted
-
-
-def test_kl_bounds_of_single_components() -> None:
-    rng = np.random.default_rng(1)
-    first, second = draw(rng, 5, count=1), draw(rng, 5, count=1)
-    wanted = kl_divergence(first.mean[:, 0], first.cov[:, 0], second.mean[:, 0], second.cov[:, 0])
-    lower, upper = divergence.kl_bounds(first, second)
-    assert (lower <= wanted).all()
-    assert (upper >= wanted - 1e-9).all()
-    assert (divergence.kl_bounds(first, first)[0] <= 1e-12).all()
-
-
-def test_standard_error_of_monte_carlo_is_the_spread_of_repeats() -> None:
-    rng = np.random.default_rng(2)
-    first, second = draw(rng, count=1), draw(rng, count=3)
-    repeats = [divergence.kl_monte_carlo(first, second, np.random.default_rng(i), 200) for i in range(200)]
-    spread, error = np.std([r.value for r in repeats]), np.mean([r.error for r in repeats])
-    assert error == pytest.approx(spread, rel=0.2)
+    points = grid(np.array([-40.0]), np.array([40.0]), 8000)
+    logs = log_pdf(first, points), log_pdf(second, points)
+    assert kl_on_grid(*logs) == pytest.approx(wanted, rel=1e-6)
+    both = np.stack(logs)  # several at once; a constant in a logarithm changes nothing
+    np.testing.assert_allclose(kl_on_grid(both + 7.0, both[::-1]), [wanted, kl_on_grid(logs[1], logs[0])], rtol=1e-6)
 
 
 def test_moments_on_a_grid() -> None:
     mixture = draw(np.random.default_rng(3), count=3, spread=1.0)
-    points = divergence.grid(np.full(2, -25.0), np.full(2, 25.0), 250)
-    mean, cov = divergence.moments_on_grid(lambda x: log_pdf(mixture, x), points)
+    points = grid(np.full(2, -25.0), np.full(2, 25.0), 250)
+    mean, cov = moments_on_grid(log_pdf(mixture, points), points)
     np.testing.assert_allclose(mean, moments(mixture)[0], atol=1e-6)
     np.testing.assert_allclose(cov, moments(mixture)[1], atol=1e-2)  # the cells' own spread, .2^2 / 12
 
@@ -135,7 +114,7 @@ def test_cap_and_prune() -> None:
     mixture = draw(rng, 2, count=5)
     capped = reduction.cap(mixture, 2)
     np.testing.assert_allclose(capped.weight.sum(-1), 1.0)
-    np.testing.assert_array_equal(capped.mean[:, 0], extraction.heaviest_mode(mixture))
+    np.testing.assert_array_equal(capped.mean[:, 0], mixture.mean[np.arange(2), mixture.weight.argmax(-1)])
     weight = np.array([[0.5, 0.3, 0.15, 0.04, 0.01], [0.9, 0.09, 0.005, 0.004, 0.001]])
     kept, dropped = reduction.prune(Mixture(weight, mixture.mean, mixture.cov), 0.02)
     assert kept.count == 4
@@ -145,39 +124,3 @@ def test_cap_and_prune() -> None:
         reduction.cap(mixture, 0)
     with pytest.raises(ValueError, match="must be >= 1. Got 0."):
         reduction.runnalls(mixture, 0)
-
-
-# Extraction.
-
-
-def test_the_three_point_estimates_differ_where_they_should() -> None:
-    """A heavy broad component, and two lighter ones that overlap into the highest peak."""
-    mixture = Mixture(
-        np.array([0.4, 0.3, 0.3]), np.array([[0.0], [5.0], [5.4]]), np.array([4.0, 0.5, 0.5])[:, None, None]
-    )
-    assert extraction.expected_a_posteriori(mixture)[0] == pytest.approx(3.12)
-    assert extraction.heaviest_mode(mixture)[0] == 0.0
-    assert extraction.global_mode(mixture)[0] == pytest.approx(5.2, abs=0.05)
-
-
-@pytest.mark.parametrize("n", [1, 3])
-def test_global_mode_is_the_best_of_an_independent_optimiser(n: int) -> None:
-    batch = draw(np.random.default_rng(7), 4, count=4, n=n, spread=1.5)
-    modes = extraction.global_mode(batch)
-    for k in range(4):
-        mixture = batch.at(k)
-
-        def fall(x: Array, mixture: Mixture = mixture) -> float:
-            return -float(log_pdf(mixture, x[None])[0])
-
-        best = min(minimize(fall, m, method="Nelder-Mead", options={"xatol": 1e-8, "fatol": 1e-12}).fun
-                   for m in mixture.mean)  # fmt: skip
-        assert fall(modes[k]) <= best + 1e-9
-        gradient = Factored.of(mixture).derivatives(modes[k][None])[1]
-        assert np.abs(gradient).max() < 1e-6
-
-
-def test_threshold_and_rank() -> None:
-    phd = Mixture(np.array([[0.9, 0.2, 0.7], [0.1, 0.1, 0.2]]), np.zeros((2, 3, 1)), np.ones((2, 3, 1, 1)))
-    np.testing.assert_array_equal(extraction.above_threshold(phd, 0.5), [[True, False, True], [False] * 3])
-    np.testing.assert_array_equal(extraction.by_rank(phd), [[True, False, True], [False] * 3])

@@ -12,19 +12,20 @@ from track_fusion.params import ParameterError
 from track_fusion.rules import RULES
 from track_fusion.scenarios import judged_claims
 from track_fusion.scenarios.ahmed import maneuver, platforms
-from track_fusion.study.scenario import RuleChoice
+from track_fusion.study.rule_choice import RuleChoice
 
 STEPS = 125
 
 
 @pytest.fixture(scope="module")
-def samples():
-    return maneuver.sample(range(2), 0, lambda share: None, steps=STEPS)
+def outcomes():
+    return maneuver.simulate(range(2), 0, lambda share: None, steps=STEPS)
 
 
-def test_errors_right_after_the_fusions_are_those_of_the_errata(samples):
+@pytest.mark.slow
+def test_errors_right_after_the_fusions_are_those_of_the_errata(outcomes):
     """ERRATA, Example 4: IGS median <= 30 m; log10 ratio FOCI / IGS >= .7 at platform 2; centralised <= IGS."""
-    found = maneuver.figures(samples)
+    found = maneuver.figures(outcomes)
     assert found["gsf-mixture_wep/median_position_error_m"].value <= 30.0
     assert found["gsf-mixture_wep@foci/log10_error_ratio_to_igs_p2_1"].value >= 0.7
     centre, igs = (found[f"{row}/median_position_error_m"].value for row in (maneuver.CENTRE, maneuver.BY_IGS))
@@ -33,28 +34,30 @@ def test_errors_right_after_the_fusions_are_those_of_the_errata(samples):
     assert order["verdict"] == "agrees"
 
 
-def test_figures_are_what_they_say(samples):
-    found = maneuver.figures(samples)
-    error = samples["gsf-mixture_wep error"]
+@pytest.mark.slow
+def test_figures_are_what_they_say(outcomes):
+    found = maneuver.figures(outcomes)
+    error = outcomes["gsf-mixture_wep error"]
     at = [59, 119]
     by_run = [
         np.median([np.hypot(error[r, p, k, 0], error[r, p, k, 2]) for p in range(3) for k in at]) for r in range(2)
     ]
     assert found["gsf-mixture_wep/median_position_error_m"].value == pytest.approx(np.mean(by_run))
     ratio = [
-        np.log10(np.hypot(*samples["gsf-mixture_wep@foci error"][r, 1, k, ::2]) / np.hypot(*error[r, 1, k, ::2]))
+        np.log10(np.hypot(*outcomes["gsf-mixture_wep@foci error"][r, 1, k, ::2]) / np.hypot(*error[r, 1, k, ::2]))
         for r in range(2)
         for k in at
     ]
     assert found["gsf-mixture_wep@foci/log10_error_ratio_to_igs_p2_1"].value == pytest.approx(np.mean(ratio))
 
 
-def test_until_they_talk_the_platforms_are_the_independent_ones(samples):
+@pytest.mark.slow
+def test_until_they_talk_the_platforms_are_the_independent_ones(outcomes):
     for row in (maneuver.BY_IGS, maneuver.BY_FOCI):
-        np.testing.assert_array_equal(samples[f"{row} error"][:, :, :59], samples["gsf-alone error"][:, :, :59])
-        assert (samples[f"{row} error"][:, :, 59] != samples["gsf-alone error"][:, :, 59]).all()
+        np.testing.assert_array_equal(outcomes[f"{row} error"][:, :, :59], outcomes["gsf-alone error"][:, :, :59])
+        assert (outcomes[f"{row} error"][:, :, 59] != outcomes["gsf-alone error"][:, :, 59]).all()
         # What they held just before they talked for the first time is what independent ones hold.
-        np.testing.assert_array_equal(samples[f"{row} before"][:, :, 0], samples["gsf-alone variance"][:, :, 59])
+        np.testing.assert_array_equal(outcomes[f"{row} before"][:, :, 0], outcomes["gsf-alone variance"][:, :, 59])
 
 
 def test_the_truth_turns_by_the_chain_and_is_disturbed_by_its_process_noise():
@@ -131,27 +134,28 @@ def test_pieces_equal_the_whole_and_progress_goes_up(monkeypatch):
     for module in (maneuver, platforms):  # two fusions in a few steps
         monkeypatch.setattr(module, "SCHEDULE", dataclasses.replace(platforms.SCHEDULE, period=5))
     shares = []
-    whole = maneuver.sample([3, 8], 2, shares.append, "gsf-mixture_wep", steps=11)
+    whole = maneuver.simulate([3, 8], 2, shares.append, "gsf-mixture_wep", steps=11)
     assert whole["gsf-mixture_wep before"].shape == (2, 3, 2, 4)
     for row in (maneuver.BY_IGS, maneuver.BY_FOCI):
         assert (whole[f"{row} before"] != whole[f"{row} variance"][:, :, 4::5]).all()
     assert shares == sorted(shares)
     assert shares[-1] == pytest.approx(1.0)
-    part = maneuver.sample([8], 2, lambda share: None, "gsf-mixture_wep", steps=11)
+    part = maneuver.simulate([8], 2, lambda share: None, "gsf-mixture_wep", steps=11)
     for name, values in part.items():
         np.testing.assert_allclose(values[0], whole[name][1], rtol=1e-9, atol=1e-9, err_msg=name)
 
 
-def test_charts_and_figures_cope_with_parts(samples):
-    assert len(maneuver.charts(samples)) == 1 + 4 + 2
-    centre = {name: values for name, values in samples.items() if name.startswith(("truth", maneuver.CENTRE))}
+@pytest.mark.slow
+def test_charts_and_figures_cope_with_parts(outcomes):
+    assert len(maneuver.charts(outcomes)) == 1 + 4 + 2
+    centre = {name: values for name, values in outcomes.items() if name.startswith(("truth", maneuver.CENTRE))}
     assert set(maneuver.figures(centre)) == {f"gsf-ic/{q}" for q in (
         "median_position_error_m", "median_velocity_error_mps", "median_position_error_all_steps_m",
         "median_velocity_error_all_steps_mps", "share_inside_2_sigma_1")}  # fmt: skip
     assert len(maneuver.charts(centre)) == 7
-    foci = {name: values for name, values in samples.items() if name.startswith(("truth", maneuver.BY_FOCI))}
+    foci = {name: values for name, values in outcomes.items() if name.startswith(("truth", maneuver.BY_FOCI))}
     assert f"{maneuver.BY_FOCI}/share_of_fusions_that_shrink_2_sigma_1" in maneuver.figures(foci)
-    one = maneuver.figures({name: values[:1] for name, values in samples.items()})
+    one = maneuver.figures({name: values[:1] for name, values in outcomes.items()})
     assert all(np.isfinite(estimate.value) for estimate in one.values())
 
 

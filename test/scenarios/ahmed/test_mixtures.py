@@ -10,14 +10,16 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from track_fusion.densities.mixture.mixture import Mixture
+from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.params import ParameterError, from_dict
 from track_fusion.rules import RULES
 from track_fusion.scenarios import judged_claims
 from track_fusion.scenarios.ahmed import proposals as ahmed_proposals
 from track_fusion.scenarios.ahmed import random as ahmed_random
-from track_fusion.scenarios.ahmed.mixtures import CELL_AREA, GRID, Problem, divergence, log_fused, random_mixture
-from track_fusion.study.scenario import RuleChoice, Samples
+from track_fusion.scenarios.ahmed.mixtures import CELL_AREA, GRID, Problem, log_fused, random_mixture
+from track_fusion.study.rows import Outcomes
+from track_fusion.study.rule_choice import RuleChoice
 
 #: ERRATA speaks of medians over 20 or more problems.
 PROBLEMS = 20
@@ -28,11 +30,11 @@ def silent(share: float) -> None:
     pass
 
 
-def drawn(scenario: Any, runs: Any, *starts: str, seed: int = 0) -> Samples:
+def drawn(scenario: Any, runs: Any, *starts: str, seed: int = 0) -> Outcomes:
     """Samples of the rows whose names start with any of these."""
-    found: Samples = {}
+    found: Outcomes = {}
     for start in starts:
-        found |= scenario.sample(runs, seed, silent, start)
+        found |= scenario.simulate(runs, seed, silent, start)
     return found
 
 
@@ -44,7 +46,7 @@ def study() -> dict[str, Estimate]:
 
 
 @pytest.fixture(scope="module")
-def proposals() -> Samples:
+def proposals() -> Outcomes:
     return drawn(ahmed_proposals, range(60), "")
 
 
@@ -55,6 +57,7 @@ def of(figures: dict[str, Estimate], rule: str, variant: str, quantity: str = "k
 # The random study.
 
 
+@pytest.mark.slow
 def test_medians_lie_within_the_bounds_of_the_errata(study: dict[str, Estimate]) -> None:
     for rule, most_dls, most_igs in (("exact", 0.03, 0.06), ("wep", 0.012, 0.06)):
         assert of(study, rule, "dls_200") <= most_dls
@@ -64,6 +67,7 @@ def test_medians_lie_within_the_bounds_of_the_errata(study: dict[str, Estimate])
     assert of(study, "wep", "igs_100") > of(study, "wep", "foci")  # a hundred samples are worse than none
 
 
+@pytest.mark.slow
 def test_more_samples_are_always_better(study: dict[str, Estimate]) -> None:
     for rule in ("exact", "wep"):
         for method, counts in (("dls", (10, 50, 100, 200)), ("igs", (100, 500, 1000, 2000))):
@@ -71,6 +75,7 @@ def test_more_samples_are_always_better(study: dict[str, Estimate]) -> None:
             assert medians == sorted(medians, reverse=True), (rule, method)
 
 
+@pytest.mark.slow
 def test_a_proposal_that_counts_overlaps_needs_fewer_samples(study: dict[str, Estimate]) -> None:
     for count in (100, 500, 1000, 2000):
         for quantity, better in (("kld_nats", -1.0), ("effective_samples_1", 1.0)):
@@ -80,6 +85,7 @@ def test_a_proposal_that_counts_overlaps_needs_fewer_samples(study: dict[str, Es
             assert better * (ours - printed) > 0
 
 
+@pytest.mark.slow
 def test_claims_about_the_study_are_judged_as_the_errata_say(study: dict[str, Estimate]) -> None:
     found = {c["claim"]: c["verdict"] for c in judged_claims(ahmed_random.SCENARIO, study)}
     for kind in ("exact", "WEP"):
@@ -105,18 +111,18 @@ def test_times_alone_differ_from_call_to_call_and_pieces_equal_the_whole() -> No
 
 def test_every_row_gives_figures_by_name_and_charts() -> None:
     """One problem of each row, with charts of subsets."""
-    samples = drawn(ahmed_random, [0], "")
-    found = ahmed_random.figures(samples)
+    outcomes = drawn(ahmed_random, [0], "")
+    found = ahmed_random.figures(outcomes)
     assert set(ahmed_random.SCENARIO.published) <= set(found)
     assert all(NAME.match(name) for name in found)
     assert all(name in found for claim in ahmed_random.SCENARIO.claims for name in claim.needs)
-    assert {c.title.partition(":")[0] for c in ahmed_random.charts(samples)} == {
+    assert {c.title.partition(":")[0] for c in ahmed_random.charts(outcomes)} == {
         "Exact fusion", "WEP fusion", "Exact fusion, first example", "WEP fusion, first example",
     }  # fmt: skip
-    one = {name: values for name, values in samples.items() if "mmgd" in name}
+    one = {name: values for name, values in outcomes.items() if "mmgd" in name}
     assert len(ahmed_random.charts(one)) == 2  # of the study and of the example
-    shape = samples["given-mixture_exact@example_mmgd/truth"].shape
-    assert shape == samples["given-mixture_exact@example_mmgd/density"].shape
+    shape = outcomes["given-mixture_exact@example_mmgd/truth"].shape
+    assert shape == outcomes["given-mixture_exact@example_mmgd/density"].shape
 
 
 # Problems and the truth.
@@ -156,7 +162,7 @@ def test_divergence_on_the_grid_is_that_of_gaussians_in_closed_form() -> None:
     inverse = np.linalg.inv(other)
     size = np.log(np.linalg.det(other) / np.linalg.det(cov))
     wanted = 0.5 * (np.trace(inverse @ cov) + gap @ inverse @ gap - 2.0 + size)
-    assert divergence(*logs) == pytest.approx(wanted, rel=1e-6)
+    assert kl_on_grid(*logs) == pytest.approx(wanted, rel=1e-6)
 
 
 @pytest.mark.parametrize("rule", ["mixture_exact", "mixture_wep"])
@@ -165,13 +171,13 @@ def test_single_components_are_fused_without_error(rule: str) -> None:
     fused = RULES[rule].fuse(problem.tracks(np.random.default_rng(0)), RULES[rule].params())
     omega = 0.0 if fused.weights is None else float(fused.weights[0])
     truth = problem.log_exact() if rule == "mixture_exact" else problem.log_wep(omega)
-    assert divergence(truth, log_fused(fused)) == pytest.approx(0.0, abs=1e-9)
+    assert kl_on_grid(truth, log_fused(fused)) == pytest.approx(0.0, abs=1e-9)
 
 
 # Proposals.
 
 
-def test_effective_samples_grow_from_ingis_to_lagis_to_heavy_tails(proposals: Samples) -> None:
+def test_effective_samples_grow_from_ingis_to_lagis_to_heavy_tails(proposals: Outcomes) -> None:
     """ERRATA: the order of the mean share of effective samples is robust. The differences are many standard errors."""
     figures = ahmed_proposals.figures(proposals)
     for quantity in ("ess_1", "weighted_ess_1"):
@@ -186,7 +192,7 @@ def test_effective_samples_grow_from_ingis_to_lagis_to_heavy_tails(proposals: Sa
     assert set(ahmed_proposals.SCENARIO.published) <= set(figures)
 
 
-def test_shares_of_effective_samples_are_those_of_quadrature(proposals: Samples) -> None:
+def test_shares_of_effective_samples_are_those_of_quadrature(proposals: Outcomes) -> None:
     """In the limit of many samples: (integral of m)^2 / integral of m^2 / q, by summation, with scipy's densities."""
     problem = ahmed_proposals.problem(0, 0)
     case = ahmed_proposals.Case(0, 0)
@@ -210,7 +216,7 @@ def test_shares_of_effective_samples_are_those_of_quadrature(proposals: Samples)
     assert np.corrcoef(share, expected)[0, 1] > 0.95
 
 
-def test_bounds_lie_above_the_weights_and_tell_the_negligible(proposals: Samples) -> None:
+def test_bounds_lie_above_the_weights_and_tell_the_negligible(proposals: Outcomes) -> None:
     bound, true = (proposals[f"given-mixture_exact@bound/{name}"] for name in ("mixands", "true_mixands"))
     assert (bound >= true - 1e-6).all()
     assert (bound - true).max() > 5.0  # loose in many cases
@@ -218,7 +224,7 @@ def test_bounds_lie_above_the_weights_and_tell_the_negligible(proposals: Samples
     assert proposals["given-mixture_exact@bound/negligible_1"].mean() > 0.05  # there is something to gain
 
 
-def test_problems_of_proposals_do_not_depend_on_each_other_and_subsets_have_charts(proposals: Samples) -> None:
+def test_problems_of_proposals_do_not_depend_on_each_other_and_subsets_have_charts(proposals: Outcomes) -> None:
     part = drawn(ahmed_proposals, [7], "given-mixture_exact@lagis")
     for name, values in part.items():
         np.testing.assert_array_equal(values[0], proposals[name][7])

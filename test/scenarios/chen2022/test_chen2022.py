@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from track_fusion.filters.gaussian_student_t_mixture import GaussianStudentTMixture, MixtureNoiseParams
 from track_fusion.linalg import Array
 from track_fusion.models.noise import Noise
 from track_fusion.params import ParameterError
+from track_fusion.random_streams import stream
 from track_fusion.rules import RULES, SourceTracks
 from track_fusion.rules.split_covariance_intersection import SplitCovarianceIntersectionParams
 from track_fusion.scenarios import SCENARIOS, RuleChoice, judged_claims
@@ -19,7 +21,8 @@ from track_fusion.scenarios.chen2022 import dynamic, static
 from track_fusion.scenarios.chen2022 import dynamic_1 as case_1
 from track_fusion.scenarios.chen2022 import dynamic_2 as case_2
 from track_fusion.scenarios.chen2022.dynamic import DCI, FCI, GP, KLA, MHDP_E, MHDP_I, QMMHD
-from track_fusion.study.scenario import Samples, Tracking
+from track_fusion.study.rows import Outcomes
+from track_fusion.study.scene import Tracking
 
 CASES = {"I": case_1.TRACKING, "II": case_2.TRACKING}
 #: The first steps, for comparisons of mechanics.
@@ -47,7 +50,7 @@ ERRATA_STATIC = {
 
 @pytest.mark.parametrize("name", ERRATA_STATIC)
 def test_static_distances_are_those_of_the_errata(name: str) -> None:
-    measured = static.SCENARIO.study(1, 0)
+    measured = static.SCENARIO.measure(1, 0)
     mhdp, fci = ERRATA_STATIC[name]
     for key in ("mhdp_explicit", "mhdp_iterative"):
         assert measured[f"given-{key}@{name}/rao_distance_1"].value == pytest.approx(mhdp, abs=1e-4)
@@ -63,7 +66,7 @@ def test_unsquared_distances_give_one_sensors_estimate(name: str) -> None:
 
 
 def test_static_claims() -> None:
-    found = {c["claim"]: c["verdict"] for c in judged_claims(static.SCENARIO, static.SCENARIO.study(1, 0))}
+    found = {c["claim"]: c["verdict"] for c in judged_claims(static.SCENARIO, static.SCENARIO.measure(1, 0))}
     printed = [verdict for claim, verdict in found.items() if "as printed" in claim]
     others = [verdict for claim, verdict in found.items() if "as printed" not in claim]
     assert printed == ["does not reproduce"] * 2
@@ -120,7 +123,7 @@ def test_noise_is_drawn_step_by_step_and_by_role() -> None:
     for other in (noise.draw(1, 2, "sensor_2", 50, 2), noise.draw(1, 3, "sensor_1", 50, 2)):
         assert not np.isclose(other, long).any()
     # By itself what the filters are told: as before there was any other.
-    np.testing.assert_array_equal(Noise().draw(1, 2, "a", 5, 2), dynamic.stream(1, 2, "a").standard_normal((5, 2)))
+    np.testing.assert_array_equal(Noise().draw(1, 2, "a", 5, 2), stream(1, 2, "a").standard_normal((5, 2)))
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -191,13 +194,11 @@ def test_student_rows_equal_the_papers_recursion_in_scatters(case: str, choice: 
     np.testing.assert_allclose(fused, scatters_fused(SHORT[case], choice, 6, 8), rtol=1e-6, atol=1e-6)
 
 
-def test_mixture_filter_without_outliers_is_the_kalman_filter(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mixture_filter_without_outliers_is_the_kalman_filter() -> None:
     """With the prior count of Student-t noises at nothing its posterior scatter is Kalman's of nominal Q, R and P."""
-    trusting = dynamic.gaussian_student_t_mixture.MixtureNoiseParams(gaussian_count=1e9, student_count=1e-9)
-    update = dynamic.gaussian_student_t_mixture.update
-    monkeypatch.setattr(dynamic.gaussian_student_t_mixture, "update", lambda *args: update(*args, trusting))
+    trusting = GaussianStudentTMixture(MixtureNoiseParams(gaussian_count=1e9, student_count=1e-9), dynamic.DOF)
     mean, cov, sensor = np.array([[1.0, 2.0]]), np.array([[[9.0, 1.0], [1.0, 6.0]]]), dynamic.SENSOR_3
-    found, found_cov, _ = dynamic.mixture_update(mean, cov, np.array([[2.0, 1.0]]), sensor)
+    found, found_cov = trusting.update(trusting.begin(mean, cov), np.array([[2.0, 1.0]]), sensor)[0].moments
     info = np.linalg.inv(cov[0] / 3.0) + np.linalg.inv(np.array(R_3))
     np.testing.assert_allclose(found_cov[0], 3.0 * np.linalg.inv(info), rtol=1e-6)
     wanted = np.linalg.solve(info, np.linalg.solve(cov[0] / 3.0, mean[0]) + np.linalg.solve(R_3, [2.0, 1.0]))
@@ -218,7 +219,7 @@ def test_pieces_equal_the_whole(case: str) -> None:
 
 def test_only_the_rows_asked_for_are_run() -> None:
     seen: list[float] = []
-    some = case_2.SCENARIO.sample([1], 3, seen.append, "stf-covariance")
+    some = case_2.SCENARIO.simulate([1], 3, seen.append, "stf-covariance")
     assert list(some) == [f"stf-{DCI}", f"stf-{KLA}"]
     assert seen == sorted(seen)
     assert seen[-1] == pytest.approx(1.0)
@@ -229,8 +230,8 @@ def test_comparison_is_the_root_of_the_time_averaged_square() -> None:
     choices, scenario = (dynamic.RULE_CHOICES[3], dynamic.RULE_CHOICES[5]), case_2.SCENARIO
     assert scenario.compare is not None
     found = dynamic.compared(SHORT["II"], choices, [0, 4], 2, silent)
-    samples = dynamic.squared_errors(SHORT["II"], dynamic.rows(choices), [0, 4], 2, silent)
-    wanted = np.sqrt(samples[f"stf-{MHDP_E}"].mean(1))
+    outcomes = dynamic.squared_errors(SHORT["II"], dynamic.rows(choices), [0, 4], 2, silent)
+    wanted = np.sqrt(outcomes[f"stf-{MHDP_E}"].mean(1))
     np.testing.assert_allclose(found[f"stf-{MHDP_E}/position_rmse_m"], wanted, rtol=1e-12)
     assert len(found) == 4
     with pytest.raises(ParameterError, match="split_covariance_intersection"):
@@ -243,18 +244,19 @@ RUNS, STEPS = 40, 60
 
 
 @pytest.fixture(scope="module")
-def errors() -> dict[str, Samples]:
+def errors() -> dict[str, Outcomes]:
     """Squared errors of the Student-t rows of Table 1 in both cases, in the first 60 of the 100 steps."""
     rows = {name: row for name, row in dynamic.rows(dynamic.RULE_CHOICES[:7]).items() if name.startswith("stf-")}
     cases = {case: dataclasses.replace(t, steps=STEPS) for case, t in CASES.items()}
     return {case: dynamic.squared_errors(t, rows, range(RUNS), 1, silent) for case, t in cases.items()}
 
 
-def armses(errors: Samples) -> dict[str, float]:
+def armses(errors: Outcomes) -> dict[str, float]:
     return {name.removeprefix("stf-"): float(np.sqrt(squares.mean(0)).mean()) for name, squares in errors.items()}
 
 
-def test_order_of_case_2(errors: dict[str, Samples]) -> None:
+@pytest.mark.slow
+def test_order_of_case_2(errors: dict[str, Outcomes]) -> None:
     """ERRATA: MHDP < QMMHD < {GP, FCI, KLA} < DCI with MHDP <= .8 KLA."""
     found = armses(errors["II"])
     assert max(found[MHDP_E], found[MHDP_I]) < found[QMMHD] < min(found[GP], found[FCI], found[KLA])
@@ -278,7 +280,8 @@ def test_excess_has_the_spread_of_paired_studies() -> None:
     assert spread < 0.6 * np.mean([figures[f"stf-{GP}/{dynamic.FIGURE}"].standard_error for figures in found])
 
 
-def test_claims_of_case_2_hold_with_the_student_t_filter(errors: dict[str, Samples]) -> None:
+@pytest.mark.slow
+def test_claims_of_case_2_hold_with_the_student_t_filter(errors: dict[str, Outcomes]) -> None:
     found = judged_claims(case_2.SCENARIO, dynamic.figures(errors["II"]))
     assert [claim["verdict"] for claim in found] == ["agrees"] * 3
 
@@ -291,14 +294,16 @@ def test_the_rule_behind_mhdp_is_the_one_of_the_printed_column() -> None:
                          f"gstm-{FCI}/{figure}"]  # fmt: skip
 
 
-def test_advantage_of_mhdp_in_case_1_does_not_reproduce(errors: dict[str, Samples]) -> None:
+@pytest.mark.slow
+def test_advantage_of_mhdp_in_case_1_does_not_reproduce(errors: dict[str, Outcomes]) -> None:
     """ERRATA."""
     found = judged_claims(case_1.SCENARIO, dynamic.figures(errors["I"]))
     assert [claim["verdict"] for claim in found] == ["does not reproduce"] * 2 + ["agrees"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
-def test_determinant_intersection_is_far_worse_and_the_two_mhdp_agree(errors: dict[str, Samples], case: str) -> None:
+def test_determinant_intersection_is_far_worse_and_the_two_mhdp_agree(errors: dict[str, Outcomes], case: str) -> None:
     """ERRATA: DCI > 2 x every other rule in both cases; |MHDP-E - MHDP-I| <= .02 m."""
     found = armses(errors[case])
     assert found.pop(DCI) > 2.0 * max(found.values())

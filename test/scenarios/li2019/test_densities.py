@@ -16,7 +16,7 @@ from track_fusion.scenarios.li2019.densities import AA, GA, PAIRS, SCENARIO, THE
 
 @pytest.fixture(scope="module")
 def measured():
-    return SCENARIO.study(1, 0)
+    return SCENARIO.measure(1, 0)
 
 
 def test_variances_at_equal_weights_are_those_of_the_errata(measured):
@@ -108,7 +108,7 @@ def test_rules_are_compared_by_their_error():
 
 def test_rows_can_be_chosen_and_progress_goes_to_the_end():
     seen = []
-    found = SCENARIO.sample(range(3), 0, seen.append, f"{GA}@fig5")
+    found = SCENARIO.simulate(range(3), 0, seen.append, f"{GA}@fig5")
     assert {name.partition("/")[0] for name in found} == {f"{GA}@fig5"}
     assert all(values.shape == (3,) for values in found.values())
     assert seen[-1] == 1.0
@@ -118,7 +118,7 @@ def test_rows_can_be_chosen_and_progress_goes_to_the_end():
 
 
 def test_charts():
-    panels = SCENARIO.charts(SCENARIO.sample([0], 0, lambda share: None, ""))
+    panels = SCENARIO.charts(SCENARIO.simulate([0], 0, lambda share: None, ""))
     assert [chart.title.partition(":")[0] for chart in panels] == ["Fig. 5"] * 3 + ["Fig. 6"] * 3 + ["Appendix B"]
     excess = panels[2].contours[0].z
     assert excess.min() < 0 < excess.max()  # the averages cross over

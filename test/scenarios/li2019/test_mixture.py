@@ -23,7 +23,7 @@ GM_2 = [(0.9, 11.0, 100.0), (0.8, 52.0, 120.0)]
 
 @pytest.fixture(scope="module")
 def measured():
-    return SCENARIO.study(1, 0)
+    return SCENARIO.measure(1, 0)
 
 
 def _sum(parts, power=1.0):
@@ -92,10 +92,10 @@ def test_averages_have_the_least_divergences():
 
 def test_rows_can_be_chosen():
     seen = []
-    found = SCENARIO.sample(range(2), 0, seen.append, EXACT)
+    found = SCENARIO.simulate(range(2), 0, seen.append, EXACT)
     assert {name.partition("/")[0] for name in found} == {EXACT}
     assert seen[-1] == 1.0
     (chart,) = SCENARIO.charts(found)
     assert [line.label for line in chart.series] == ["GM 1", "GM 2", "geometric, exact"]
-    panels = SCENARIO.charts(SCENARIO.sample([0], 0, lambda share: None, ""))
+    panels = SCENARIO.charts(SCENARIO.simulate([0], 0, lambda share: None, ""))
     assert [len(panel.series) for panel in panels] == [5, 6]

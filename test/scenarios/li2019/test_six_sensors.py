@@ -31,13 +31,13 @@ from track_fusion.scenarios.li2019.six_sensors import (
 
 
 @pytest.fixture(scope="module")
-def samples():
-    return SCENARIO.sample(range(60), 1, lambda share: None, "")
+def outcomes():
+    return SCENARIO.simulate(range(60), 1, lambda share: None, "")
 
 
 @pytest.fixture(scope="module")
-def measured(samples):
-    return SCENARIO.figures(samples)
+def measured(outcomes):
+    return SCENARIO.figures(outcomes)
 
 
 @pytest.fixture(scope="module")
@@ -162,32 +162,32 @@ def test_claims(measured):
     assert shares == sorted(shares)
 
 
-def test_pieces_equal_the_whole(samples):
+def test_pieces_equal_the_whole(outcomes):
     for only in (AA, EXACT, f"{GA}@sensors3"):
-        pieces = [SCENARIO.sample(part, 1, lambda share: None, only) for part in ([0], [1, 2], [3, 4, 5])]
+        pieces = [SCENARIO.simulate(part, 1, lambda share: None, only) for part in ([0], [1, 2], [3, 4, 5])]
         for name in pieces[0]:
-            np.testing.assert_allclose(np.concatenate([p[name] for p in pieces]), samples[name][:6], rtol=1e-9)
-    few = SCENARIO.figures(SCENARIO.sample([0], 1, lambda share: None, AA))
+            np.testing.assert_allclose(np.concatenate([p[name] for p in pieces]), outcomes[name][:6], rtol=1e-9)
+    few = SCENARIO.figures(SCENARIO.simulate([0], 1, lambda share: None, AA))
     assert f"{AA}/lost_targets_1" in few
     assert np.isnan(few[f"{AA}/lost_targets_1"].standard_error)
 
 
-def test_any_rules_are_compared(samples):
+def test_any_rules_are_compared(outcomes):
     rules = [*SCENARIO.rules, RuleChoice("naive", NaiveParams())]
     found = SCENARIO.compare(rules, range(4), 1, lambda share: None)
     for row in (AA, GA):
-        np.testing.assert_array_equal(found[f"{row}/lost_targets_1"], samples[f"{row}/lost"][:4].sum(-1))
-        np.testing.assert_allclose(found[f"{row}/far_mass_1"], samples[f"{row}/far"][:4], rtol=1e-9)
+        np.testing.assert_array_equal(found[f"{row}/lost_targets_1"], outcomes[f"{row}/lost"][:4].sum(-1))
+        np.testing.assert_allclose(found[f"{row}/far_mass_1"], outcomes[f"{row}/far"][:4], rtol=1e-9)
     assert (found["given-naive/lost_targets_1"] >= 3).all()  # one Gaussian cannot cover them all
     needy = RuleChoice("split_covariance_intersection", SplitCovarianceIntersectionParams())
     with pytest.raises(ParameterError, match="which needs '.*' beside the tracks"):
         SCENARIO.compare([needy], [0], 1, lambda share: None)
 
 
-def test_charts(samples):
-    panels = SCENARIO.charts(samples)
+def test_charts(outcomes):
+    panels = SCENARIO.charts(outcomes)
     assert [chart.title.partition(":")[0] for chart in panels] == [
         "Fig. 8", "Lost targets of five", "Lost by place of the target",
     ]  # fmt: skip
     assert [line.x.tolist() for line in panels[1].series] == [[2, 3, 4, 5, 6], [2, 3, 4, 5, 6], [6]]
-    assert len(SCENARIO.charts({k: v for k, v in samples.items() if k.startswith(f"{GA}@sensors3")})) == 1
+    assert len(SCENARIO.charts({k: v for k, v in outcomes.items() if k.startswith(f"{GA}@sensors3")})) == 1

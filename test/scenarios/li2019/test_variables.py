@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scenarios.li2019.quadrature import positive_normal_pair
 from scipy.stats import kstest, multivariate_normal, norm, poisson
 
 from track_fusion.params import ParameterError
 from track_fusion.scenarios import judged_claims
-from track_fusion.scenarios.li2019.averages import average_moments, positive_normal_pair
+from track_fusion.scenarios.li2019.averages import average_moments
 from track_fusion.scenarios.li2019.variable_pairs import RATES, copula_correlation, normal_pair, poisson_pair
 from track_fusion.scenarios.li2019.variables import (
     AA,
@@ -26,18 +27,18 @@ from track_fusion.scenarios.li2019.variables import (
 RUNS = 150
 
 
-def _samples(runs=range(RUNS), only=""):
-    return SCENARIO.sample(runs, 4, lambda share: None, only)
+def _outcomes(runs=range(RUNS), only=""):
+    return SCENARIO.simulate(runs, 4, lambda share: None, only)
 
 
 @pytest.fixture(scope="module")
-def samples():
-    return _samples()
+def outcomes():
+    return _outcomes()
 
 
 @pytest.fixture(scope="module")
-def measured(samples):
-    return SCENARIO.figures(samples)
+def measured(outcomes):
+    return SCENARIO.figures(outcomes)
 
 
 def _close(estimate, value, rounding=0.005):
@@ -53,14 +54,14 @@ def test_minima_of_figure_1_are_those_of_the_errata(measured):
 
 
 @pytest.mark.parametrize("variant", ["rho0", "rho70736"])
-def test_normal_variables_against_quadrature(samples, measured, variant):
+def test_normal_variables_against_quadrature(outcomes, measured, variant):
     """Variance curves and least errors; a curve's points share their draws, so bounds are those of one point."""
     correlation = {"rho0": 0.0, "rho70736": 0.70736}[variant]
     cross = correlation * np.sqrt(2.0) * 100.0
     nodes = positive_normal_pair(np.array([50.0, 60.0]), np.array([[100.0, cross], [cross, 200.0]]), 120)
     for row, geometric in ((AA, False), (GA, True)):
         mean, variance = average_moments(*nodes, WEIGHTS, geometric)
-        runs = samples[f"{row}@{variant}"]
+        runs = outcomes[f"{row}@{variant}"]
         error = variance_curve(runs).std(0) / np.sqrt(RUNS)
         assert (np.abs(variance_curve(runs.mean(0)) - variance) < 4.0 * error).all()
         assert (error < 0.01 * variance).all()
@@ -150,21 +151,21 @@ def test_figures_without_chance(measured):
 
 
 def test_pieces_equal_the_whole_and_rows_can_be_chosen():
-    whole = _samples(range(4), f"{AA}@rho")
+    whole = _outcomes(range(4), f"{AA}@rho")
     assert set(whole) == {f"{AA}@{v}" for v in VARIABLES if v.startswith("rho")}
     for name, values in whole.items():
-        pieces = [_samples(part, name)[name] for part in ([0, 1], [2], [3])]
+        pieces = [_outcomes(part, name)[name] for part in ([0, 1], [2], [3])]
         np.testing.assert_allclose(np.concatenate(pieces), values, rtol=1e-9)
-    assert set(SCENARIO.figures(_samples(range(2), f"{AA}@lognormal"))) == {f"{AA}@lognormal/least_variance_1"}
-    one = SCENARIO.figures(_samples([0], f"{GA}@rho0"))
+    assert set(SCENARIO.figures(_outcomes(range(2), f"{AA}@lognormal"))) == {f"{AA}@lognormal/least_variance_1"}
+    one = SCENARIO.figures(_outcomes([0], f"{GA}@rho0"))
     assert all(np.isnan(e.standard_error) for e in one.values())
     with pytest.raises(ParameterError, match="row"):
-        _samples([0], "given-naive")
+        _outcomes([0], "given-naive")
 
 
-def test_charts(samples):
-    panels = SCENARIO.charts(samples)
+def test_charts(outcomes):
+    panels = SCENARIO.charts(outcomes)
     assert [len(chart.series) for chart in panels] == [6, 6, 6, 6]
     ends = [line.y[[0, -1]] for line in panels[0].series]
     np.testing.assert_allclose(ends, np.broadcast_to([200.0, 100.0], (6, 2)), rtol=0.03)
-    assert len(SCENARIO.charts(_samples([0], f"{GA}@{FIGURE_1[1]}"))[0].series) == 1
+    assert len(SCENARIO.charts(_outcomes([0], f"{GA}@{FIGURE_1[1]}"))[0].series) == 1

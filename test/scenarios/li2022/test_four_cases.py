@@ -24,13 +24,13 @@ RUNS = 3
 
 
 @pytest.fixture(scope="module")
-def samples():
-    return SCENARIO.sample(range(RUNS), 0, lambda share: None)
+def outcomes():
+    return SCENARIO.simulate(range(RUNS), 0, lambda share: None)
 
 
 @pytest.fixture(scope="module")
-def measured(samples):
-    return SCENARIO.figures(samples)
+def measured(outcomes):
+    return SCENARIO.figures(outcomes)
 
 
 def test_the_assumed_pair_has_the_printed_weight(measured):
@@ -98,8 +98,8 @@ def test_modes_are_those_of_a_grid(separation):
     assert modes(Mixture(np.array([0.5, 0.5]), pair.mean, pair.cov)) == count
 
 
-def test_only_rules_that_sample_differ_from_run_to_run(samples, measured):
-    drawn = {name.rpartition("/")[0] for name, values in samples.items() if not (values == values[:1]).all()}
+def test_only_rules_that_sample_differ_from_run_to_run(outcomes, measured):
+    drawn = {name.rpartition("/")[0] for name, values in outcomes.items() if not (values == values[:1]).all()}
     assert drawn == {"given-geometric_mean_sampling"}
     sampled = measured["given-geometric_mean_sampling/trace_case_a_m2"]
     limit = measured["given-geometric_average/trace_case_a_m2"]
@@ -108,22 +108,22 @@ def test_only_rules_that_sample_differ_from_run_to_run(samples, measured):
     assert limit == Estimate.exact(limit.value)
 
 
-def test_pieces_equal_the_whole(samples):
-    part = SCENARIO.sample([2], 0, lambda share: None)
-    assert list(part) == list(samples)
+def test_pieces_equal_the_whole(outcomes):
+    part = SCENARIO.simulate([2], 0, lambda share: None)
+    assert list(part) == list(outcomes)
     for name, values in part.items():
-        np.testing.assert_allclose(values, samples[name][2:], rtol=1e-9)
+        np.testing.assert_allclose(values, outcomes[name][2:], rtol=1e-9)
 
 
-def test_pictures_show_all_rules_in_all_cases(samples):
-    charts = SCENARIO.charts(samples)
+def test_pictures_show_all_rules_in_all_cases(outcomes):
+    charts = SCENARIO.charts(outcomes)
     assert all(c.equal and len(c.series) <= 8 for c in charts)
     for case in SEPARATIONS:
         shown = [s.label for c in charts if c.title.startswith(f"({case})") for s in c.series]
         assert set(shown) == {"P1", "P2"} | {row.partition("-")[2] for row in ROWS if "alone" not in row} - {
             "arithmetic_average@mixture"
         }
-    assert len(SCENARIO.charts(SCENARIO.sample([0], 0, lambda share: None, "given-naive"))) == 4
+    assert len(SCENARIO.charts(SCENARIO.simulate([0], 0, lambda share: None, "given-naive"))) == 4
 
 
 def test_compare():

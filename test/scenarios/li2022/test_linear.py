@@ -5,9 +5,9 @@ import math
 
 import numpy as np
 import pytest
+from oracles.kalman import predict, update
 from scipy.linalg import solve_discrete_are
 
-from track_fusion.filters.kalman import predict, update
 from track_fusion.params import ParameterError
 from track_fusion.rules import RULES, SourceTracks
 from track_fusion.scenarios import RuleChoice, judged_claims, judged_figures
@@ -35,7 +35,7 @@ KALMAN = {name: row for name, row in kalman_rows().items() if not name.endswith(
 
 
 def sampled(rows, runs, seed, progress=lambda share: None):
-    return dataclasses.replace(STUDY, rows=rows).sample(runs, seed, progress)
+    return dataclasses.replace(STUDY, rows=rows).simulate(runs, seed, progress)
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +165,7 @@ def test_the_study_equals_filters_and_rule_looped_over_one_run(choice):
 
 def test_progress_goes_to_the_end():
     seen = []
-    SCENARIO.study(2, 0, seen.append, "sir-")
+    SCENARIO.measure(2, 0, seen.append, "sir-")
     assert seen == sorted(seen)
     assert seen[-1] == pytest.approx(1.0)
 
@@ -181,8 +181,8 @@ def test_truth_starts_at_the_initial_mean_and_moves_by_the_model():
 
 
 def test_charts_show_every_quantity_of_every_filter():
-    samples = sampled({n: r for n, r in KALMAN.items() if n != "kf-naive"}, range(3), 1)
-    charts = STUDY.charts(samples)
+    outcomes = sampled({n: r for n, r in KALMAN.items() if n != "kf-naive"}, range(3), 1)
+    charts = STUDY.charts(outcomes)
     assert [c.title.partition(":")[2].strip() for c in charts[:3]] == [
         "course of one trial", "position RMSE", "velocity RMSE",
     ]  # fmt: skip
@@ -190,13 +190,13 @@ def test_charts_show_every_quantity_of_every_filter():
     assert all(len(c.series) <= 8 for c in charts)
     course = {s.label: s for s in charts[0].series}
     assert set(course) == {"truth", "alone", "ic", "arithmetic_average", "covariance_intersection", "covariance_union"}
-    np.testing.assert_array_equal([course["truth"].x, course["truth"].y], samples[TRUTH][0].T)
+    np.testing.assert_array_equal([course["truth"].x, course["truth"].y], outcomes[TRUTH][0].T)
     position = {s.label: s.y for s in charts[1].series}
-    wanted = np.sqrt((samples["kf-ic/position_error_m"] ** 2).sum(-1).mean(0))
+    wanted = np.sqrt((outcomes["kf-ic/position_error_m"] ** 2).sum(-1).mean(0))
     np.testing.assert_allclose(position["ic"], wanted, rtol=1e-12)
     assert charts[3].log_y
     (weight,) = charts[4].series
-    kept = samples["kf-arithmetic_average/sensor_1_weight_1"]
+    kept = outcomes["kf-arithmetic_average/sensor_1_weight_1"]
     np.testing.assert_allclose([weight.y, weight.error], [kept.mean(0), kept.std(0)])
 
 

@@ -27,7 +27,7 @@ MEANS, VARIANCES = DENSITIES.T
 
 @pytest.fixture(scope="module")
 def measured():
-    return SCENARIO.study(1, 0)
+    return SCENARIO.measure(1, 0)
 
 
 @pytest.mark.parametrize("case", TARGETS)
@@ -93,11 +93,11 @@ def test_a_mixture_that_is_not_merged_beats_the_best_density_in_case_3_only(meas
 
 
 def test_charts(measured):
-    charts = SCENARIO.charts(SCENARIO.sample([0], 0, lambda share: None, "given-arithmetic_average@case_"))
+    charts = SCENARIO.charts(SCENARIO.simulate([0], 0, lambda share: None, "given-arithmetic_average@case_"))
     assert [len(c.series) for c in charts] == [7, 7, 7, 7, 3]
     merged = charts[0].series[5]
     np.testing.assert_allclose(merged.y, norm.pdf(merged.x, 60.0, np.sqrt(200.0)), atol=1e-9)
-    assert SCENARIO.charts(SCENARIO.sample([0], 0, lambda share: None, "given-alone")) == []
+    assert SCENARIO.charts(SCENARIO.simulate([0], 0, lambda share: None, "given-alone")) == []
 
 
 @pytest.mark.parametrize("key", RULES)

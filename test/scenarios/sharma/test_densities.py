@@ -9,20 +9,20 @@ from track_fusion.rules.mixture_exact import MixtureExactParams
 from track_fusion.scenarios import judged_claims
 from track_fusion.scenarios.sharma import gaussians as sharma_gaussians
 from track_fusion.scenarios.sharma import mixtures as sharma_mixtures
-from track_fusion.study.scenario import RuleChoice
+from track_fusion.study.rule_choice import RuleChoice
 
 RUNS = 40
 MODULES = {"gaussians": sharma_gaussians, "mixtures": sharma_mixtures}
 
 
 @pytest.fixture(scope="module")
-def samples():
-    return {key: module.sample(range(RUNS), 3, lambda share: None) for key, module in MODULES.items()}
+def outcomes():
+    return {key: module.simulate(range(RUNS), 3, lambda share: None) for key, module in MODULES.items()}
 
 
 @pytest.fixture(scope="module")
-def measured(samples):
-    return {key: module.figures(samples[key]) for key, module in MODULES.items()}
+def measured(outcomes):
+    return {key: module.figures(outcomes[key]) for key, module in MODULES.items()}
 
 
 @pytest.mark.parametrize(
@@ -102,18 +102,18 @@ def test_claims_of_the_mixtures(measured):
 
 
 @pytest.mark.parametrize("key", MODULES)
-def test_pieces_equal_the_whole_and_only_chooses_rows(samples, key):
+def test_pieces_equal_the_whole_and_only_chooses_rows(outcomes, key):
     only = "given-harmonic_mean@sampled"
-    part = MODULES[key].sample([5, 7], 3, lambda share: None, only)
+    part = MODULES[key].simulate([5, 7], 3, lambda share: None, only)
     assert all(name.startswith(only) for name in part)
     for name, values in part.items():
-        np.testing.assert_allclose(values, samples[key][name][[5, 7]], rtol=1e-9, err_msg=name)
-    assert set(MODULES[key].figures(part)) == {n for n in MODULES[key].figures(samples[key]) if n.startswith(only)}
+        np.testing.assert_allclose(values, outcomes[key][name][[5, 7]], rtol=1e-9, err_msg=name)
+    assert set(MODULES[key].figures(part)) == {n for n in MODULES[key].figures(outcomes[key]) if n.startswith(only)}
     assert MODULES[key].charts(part)
 
 
-def test_charts_of_the_gaussians_are_ellipses_of_two_sigma(samples):
-    region = sharma_gaussians.charts(samples["gaussians"])[0]
+def test_charts_of_the_gaussians_are_ellipses_of_two_sigma(outcomes):
+    region = sharma_gaussians.charts(outcomes["gaussians"])[0]
     line = region.series[0]
     offset = np.stack([line.x, line.y], -1) - sharma_gaussians.MEANS[0]
     length = np.einsum("pi,ij,pj->p", offset, np.linalg.inv(sharma_gaussians.COVS[0]), offset)
@@ -121,8 +121,8 @@ def test_charts_of_the_gaussians_are_ellipses_of_two_sigma(samples):
     assert len(region.series) == 8
 
 
-def test_charts_of_the_mixtures_show_exact_and_sampled_densities(samples):
-    _, *means = sharma_mixtures.charts(samples["mixtures"])
+def test_charts_of_the_mixtures_show_exact_and_sampled_densities(outcomes):
+    _, *means = sharma_mixtures.charts(outcomes["mixtures"])
     assert len(means) == 2
     for exact, drawn in (chart.contours for chart in means):
         assert exact.z.shape == (len(exact.y), len(exact.x))

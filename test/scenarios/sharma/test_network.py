@@ -15,7 +15,7 @@ from track_fusion.scenarios import judged_claims
 from track_fusion.scenarios.sharma import network_1 as sharma_network_1
 from track_fusion.scenarios.sharma import network_2 as sharma_network_2
 from track_fusion.scenarios.sharma.network import RULE_CHOICES, figures
-from track_fusion.study.scenario import RuleChoice
+from track_fusion.study.rule_choice import RuleChoice
 
 RUNS = 4000
 MODULES = {"1": sharma_network_1, "2": sharma_network_2}
@@ -36,13 +36,13 @@ CASES = [(key, row, *values) for key, rows in ERRATA.items() for row, values in 
 
 
 @pytest.fixture(scope="module")
-def samples():
-    return {key: module.sample(range(RUNS), 5, lambda share: None) for key, module in MODULES.items()}
+def outcomes():
+    return {key: module.simulate(range(RUNS), 5, lambda share: None) for key, module in MODULES.items()}
 
 
 @pytest.fixture(scope="module")
-def measured(samples):
-    return {key: figures(values) for key, values in samples.items()}
+def measured(outcomes):
+    return {key: figures(values) for key, values in outcomes.items()}
 
 
 @pytest.mark.parametrize(("key", "row", "reported", "errors"), CASES)
@@ -165,37 +165,37 @@ def test_every_estimate_is_consistent_before_anything_is_sent():
 
 
 @pytest.mark.parametrize("key", MODULES)
-def test_pieces_equal_the_whole_and_only_chooses_rows(samples, key):
+def test_pieces_equal_the_whole_and_only_chooses_rows(outcomes, key):
     for only in ("kf-harmonic", "kf-ellipsoidal_intersection", "kf-centralised"):
-        part = MODULES[key].sample([3, 1500], 5, lambda share: None, only)
+        part = MODULES[key].simulate([3, 1500], 5, lambda share: None, only)
         assert part
         for name, values in part.items():
             assert name.startswith(only)
-            np.testing.assert_allclose(values, samples[key][name][[3, 1500]], rtol=1e-9, atol=1e-12, err_msg=name)
+            np.testing.assert_allclose(values, outcomes[key][name][[3, 1500]], rtol=1e-9, atol=1e-12, err_msg=name)
         assert all(name.startswith(only) for name in figures(part))
         assert MODULES[key].charts(part)
 
 
 @pytest.mark.parametrize("key", MODULES)
 def test_charts_of_a_single_run(key):
-    assert MODULES[key].charts(MODULES[key].sample([0], 1, lambda share: None))
+    assert MODULES[key].charts(MODULES[key].simulate([0], 1, lambda share: None))
 
 
-def test_charts_are_two_sigma_ellipses(samples):
-    pictures = sharma_network_1.charts(samples["1"])
+def test_charts_are_two_sigma_ellipses(outcomes):
+    pictures = sharma_network_1.charts(outcomes["1"])
     assert [len(c.series) for c in pictures] == [6, 6, 6, 6, 2]
     reported, errors = pictures[0].series[:2]
-    cov = samples["1"]["kf-centralised/cov"][0]
+    cov = outcomes["1"]["kf-centralised/cov"][0]
     points = np.stack([reported.x, reported.y])
     np.testing.assert_allclose((points * np.linalg.solve(cov, points)).sum(0), 4.0)
     assert errors.x.max() == pytest.approx(reported.x.max(), rel=0.05)
 
 
 @pytest.mark.parametrize("key", MODULES)
-def test_compare_takes_any_rule_and_refuses_what_needs_more(samples, key):
+def test_compare_takes_any_rule_and_refuses_what_needs_more(outcomes, key):
     scenario = MODULES[key].SCENARIO
     found = scenario.compare(RULE_CHOICES[-2:], range(20), 5, lambda share: None)
-    wanted = np.linalg.norm(samples[key]["kf-harmonic_mean/error"][:20], axis=1)
+    wanted = np.linalg.norm(outcomes[key]["kf-harmonic_mean/error"][:20], axis=1)
     np.testing.assert_allclose(found["kf-harmonic_mean/error_1"], wanted, rtol=1e-9)
     assert found["kf-ellipsoidal_intersection/error_1"].shape == (20,)
     with pytest.raises(ParameterError, match="Got 'mixture_exact', which needs 'common' beside"):

@@ -32,7 +32,7 @@ from track_fusion.scenarios.sharma.radar_runs import (
 )
 from track_fusion.scenarios.sharma.radars import ALONE, CI, HMD, ICI, SCENARIO
 from track_fusion.scenarios.sharma.surveillance import Courses, Radar, Surveillance
-from track_fusion.study.scenario import RuleChoice
+from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.tracks import TrackBatch
 
 pytest.importorskip("pymap3d")
@@ -50,7 +50,7 @@ def great_circle_m(first, second):
 
 def test_distances_are_those_on_the_earth():
     """The plane leaves out heights and the sphere the flattening: half a percent."""
-    truth = scene().truth(0, 0)
+    truth = scene().states(0, 0)
     for name, place in RADARS.items():
         for k, moment in ((0, slice(0, 2)), (STEPS, slice(2, 4))):
             found = scene().radars[name].distance(truth[k])
@@ -61,7 +61,7 @@ def test_categories_are_the_papers_but_for_target_12():
     """ERRATA: the field of view gives every category but target 12, seen by radar 2 alone; 1 and 19 have none."""
     found = {c: (category(c) + 1).tolist() for c in CATEGORIES}
     assert found == {"a": [4, 10, 15], "b": [2, 5, 7, 8, 11, 13, 14, 16], "c": [3, 6, 9, 12, 17, 20]}
-    middle = scene().truth(0, 0)[STEPS // 2]
+    middle = scene().states(0, 0)[STEPS // 2]
     assert [name for name, radar in scene().radars.items() if radar.sees(middle)[11]] == ["radar_2"]
     assert seen_by()[17] == 0  # the paper says so of target 18
 
@@ -116,8 +116,8 @@ def test_a_scene_draws_the_same_scans_however_many_follow():
             np.testing.assert_array_equal(a, b)
     other = scene().detections(3, 8, 1)
     assert all(not np.array_equal(other[name][0][:5], few[name][0][:5]) for name in few)
-    assert scene().truth(0, 0, 2).shape == (3, 20, 4)
-    np.testing.assert_array_equal(scene().truth(0, 0, 2), scene().truth(5, 6)[:3])
+    assert scene().states(0, 0, 2).shape == (3, 20, 4)
+    np.testing.assert_array_equal(scene().states(0, 0, 2), scene().states(5, 6)[:3])
     assert (scene().layout, scene().dt_s, scene().steps) == (LAYOUT, 2.0, 150)
 
 
@@ -156,8 +156,8 @@ def quiet(monkeypatch):
 
 def test_runs_and_rows_do_not_depend_on_what_else_is_asked(quiet):
     progress = []
-    whole = SCENARIO.sample([1, 4], 9, progress.append, "pda-")
-    part = SCENARIO.sample([4], 9, lambda share: None, f"pda-{HMD}")
+    whole = SCENARIO.simulate([1, 4], 9, progress.append, "pda-")
+    part = SCENARIO.simulate([4], 9, lambda share: None, f"pda-{HMD}")
     assert set(part) == {f"pda-{HMD}/{c}" for c in ("position", "nees", "variance", "false")}
     for name, values in part.items():
         np.testing.assert_allclose(values[0], whole[name][1], rtol=1e-9, err_msg=name)
@@ -173,7 +173,7 @@ def test_compare_pools_all_judged_targets_from_the_settled_time_on(quiet):
     found = SCENARIO.compare(rules, [0], 2, lambda share: None)
     assert set(found) == {f"pda-{r}/{q}" for r in ("naive@mine", CI) for q in ("position_rmse_m", "lost_1")}
     record = tracked({"x": RULE_CHOICES[0]}, [0], 2, lambda share: None)
-    truth, squares, lost, there = scene().truth(2, 0), [], 0, 0
+    truth, squares, lost, there = scene().states(2, 0), [], 0, 0
     for f, t in enumerate(FUSION_TIMES_S):
         for target in np.concatenate([category(c) for c in CATEGORIES]) if t >= 60.0 else ():
             state = truth[(f + 1) * FUSION_SCANS, target]
@@ -223,9 +223,10 @@ def test_the_centre_fuses_its_prediction_with_the_radars_tracks():
 @pytest.fixture(scope="module")
 def measured():
     """One run, with all its clutter: some fifteen seconds."""
-    return SCENARIO.study(1, 1)
+    return SCENARIO.measure(1, 1)
 
 
+@pytest.mark.slow
 def test_what_errata_says_holds_in_one_run(measured):
     """ERRATA: NEES of CI below those of ICI and HMD-GA in categories A and B. The order of errors is not robust."""
     for c in "ab":
@@ -245,6 +246,7 @@ def test_what_errata_says_holds_in_one_run(measured):
     assert 0.0 <= measured[f"pda-{CI}/false_tracks_1"].value < 5.0
 
 
+@pytest.mark.slow
 def test_every_claim_is_judged(measured):
     found = {c["claim"]: c["verdict"] for c in judged_claims(SCENARIO, measured)}
     assert len(found) == len(SCENARIO.claims)

@@ -1,4 +1,4 @@
-"""Elliptical families: Student-t, generalised Gaussian, Gaussian, or any generating function.
+"""Elliptical families: Student-t, generalised Gaussian, Gaussian.
 
 A density of a family in m axes is |S|^-1/2 h((x - x0)' S^-1 (x - x0)) with the scatter S; its covariance is
 kappa S. Chen and Zhou 2022, section 2.2.
@@ -122,66 +122,3 @@ def generalized_gaussian(beta: Array | float, axes: int) -> Family:
         return np.asarray(constant - 0.5 * u**shape)
 
     return Family(m, a, (m + 2.0 * shape) / (4.0 * m + 8.0), kappa, log_generator)
-
-
-#: Grid of the quadrature in t = log u: wide enough for tails u^-1.05, fine enough for 12 digits.
-GRID = np.linspace(-700.0, 700.0, 140_001)
-#: Step in t of the difference quotient of log h, and the quotients below which it is rounding.
-STEP, ROUNDING = 1e-3, 1e-10
-
-
-def from_generator(
-    log_generator: Callable[[Array], Array], axes: int, slope: Callable[[Array], Array] | None = None
-) -> Family:
-    """Build a family of any generating function by quadrature of (9).
-
-    Parameters
-    ----------
-    log_generator : callable    u (N,) -> log h(u) (N,), smooth in log u; need not be normalised
-    axes : int
-    slope : callable or None    u (N,) -> d log h / d log u; None: difference quotients
-
-    Returns
-    -------
-    Family    constants of shape (), right to about 10 digits
-
-    Raises
-    ------
-    ValueError    h has no covariance, or an infinite Fisher information
-
-    Notes         With u = |z|^2 = e^t, u has the density h(u) u^(m/2) in t, and u xi is d log h / dt. The
-                  trapezoidal rule converges exponentially for the integrands, which are smooth and vanish at
-                  both ends.
-    """
-    t, m = GRID, axes
-    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-        log_mass = log_generator(np.exp(t)) + 0.5 * m * t
-        log_total = _log_integral(log_mass)
-        log_slope = 2.0 * np.log(np.abs(_quotient(log_generator, t) if slope is None else slope(np.exp(t))))
-        kappa, a, b = (
-            np.exp(_log_integral(log_mass + term) - log_total) for term in (t, log_slope - t, log_slope)
-        )  # fmt: skip
-    if not np.isfinite([kappa, a, b]).all():
-        raise ValueError("The generating function must have a covariance and a finite Fisher information.")
-
-    def normalised(u: Array) -> Array:
-        # The density of u in t is pi^(m/2) / Gamma(m/2) u^(m/2) h(u).
-        return np.asarray(log_generator(u) - log_total - 0.5 * m * math.log(math.pi) + gammaln(0.5 * m))
-
-    return Family(m, np.asarray(a / m), np.asarray(b / (m * (m + 2))), np.asarray(kappa / m), normalised)
-
-
-def _quotient(log_generator: Callable[[Array], Array], t: Array) -> Array:
-    """Five-point difference quotient of log h(e^t), zero where rounding would be all there is of it."""
-    values = [log_generator(np.exp(t + k * STEP)) for k in (-2, -1, 1, 2)]
-    slope = (values[0] - 8.0 * values[1] + 8.0 * values[2] - values[3]) / (12.0 * STEP)
-    return np.asarray(np.where(np.abs(slope) > ROUNDING * (1.0 + np.abs(values[0])), slope, 0.0))
-
-
-def _log_integral(log_values: Array) -> float:
-    """Logarithm of the integral over GRID; infinite unless the integrand has vanished at both ends."""
-    values = np.where(np.isnan(log_values), -np.inf, log_values)
-    top = float(values.max())
-    if not top < np.inf or max(values[0], values[-1]) > top - 25.0:
-        return math.inf
-    return top + math.log(float(np.exp(values - top).sum()) * (GRID[1] - GRID[0]))

@@ -90,13 +90,13 @@ def nearest_mean(mean: Array, cov: Array, pull: Array, squared: bool) -> Project
     origin = mean[:, 0]
     points = matvec(whiten, mean - origin[:, None])
     terms = _Terms(points, inverse(white), pull, squared)
-    found = _squared(terms) if squared else _unsquared(terms, white)
-    nearest = origin + matvec(lower, found.at)
-    snapped = np.flatnonzero(found.snapped >= 0)
-    nearest[snapped] = mean[snapped, found.snapped[snapped]]
+    least = _squared(terms) if squared else _unsquared(terms, white)
+    nearest = origin + matvec(lower, least.at)
+    snapped = np.flatnonzero(least.snapped >= 0)
+    nearest[snapped] = mean[snapped, least.snapped[snapped]]
     return ProjectionMean(
-        nearest, found.weights(terms), found.state.distance, found.snapped,
-        found.state.value, found.converged, found.iterations,
+        nearest, least.weights(terms), least.state.distance, least.snapped,
+        least.state.value, least.converged, least.iterations,
     )  # fmt: skip
 
 
@@ -107,6 +107,9 @@ class _State:
     value: Array
     distance: Array
     force: Array
+
+    def __getitem__(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> _State:
+        return _State(self.value[rows], self.distance[rows], self.force[rows])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -235,9 +238,8 @@ def _intersection(terms: _Terms, weights: Array) -> Array:
 def _descend(terms: _Terms, start: Array) -> _Minimum:
     """Follow each sum down from its start, (P, n), by (47) and Newton's method."""
     batch = len(start)
-    found = _Minimum(start.copy(), terms.state(start), np.full(batch, -1, np.intp), np.zeros(batch, bool),
-                     np.zeros(batch, np.intp))  # fmt: skip
     rows, part, at, state = np.arange(batch), terms, start, terms.state(start)
+    end = _Minimum(start.copy(), state[rows], np.full(batch, -1), np.zeros(batch, bool), np.zeros(batch, np.intp))
     metric = terms.info.mean(1)
     for step in range(1, MAX_STEPS + 1):
         if not len(rows):
@@ -249,12 +251,11 @@ def _descend(terms: _Terms, start: Array) -> _Minimum:
         at, state = new, new_state
         if done.any() or step == MAX_STEPS:
             out = done | (step == MAX_STEPS)
-            found.replaced(rows[out], _Minimum(at[out], _State(state.value[out], state.distance[out], state.force[out]),
-                           np.full(out.sum(), -1), done[out], np.full(out.sum(), step)))  # fmt: skip
+            count = int(out.sum())
+            end.replaced(rows[out], _Minimum(at[out], state[out], np.full(count, -1), done[out], np.full(count, step)))
             left = ~out
-            rows, part, at, metric = rows[left], part[left], at[left], metric[left]
-            state = _State(state.value[left], state.distance[left], state.force[left])
-    return found
+            rows, part, at, state, metric = rows[left], part[left], at[left], state[left], metric[left]
+    return end
 
 
 def _step(terms: _Terms, at: Array, state: _State) -> tuple[Array, _State, NDArray[np.bool_]]:

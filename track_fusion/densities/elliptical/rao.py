@@ -12,69 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.elliptical.elliptical import Family
-from track_fusion.linalg import Array, mahalanobis_squared, symmetrise, transpose
+from track_fusion.linalg import Array
 from track_fusion.solvers.optimise import minimise_on_interval
 
 
 def acosh1p(x: Array) -> Array:
     """Inverse hyperbolic cosine of 1 + x, right for small x too."""
     return np.asarray(np.log1p(x + np.sqrt(x * (x + 2.0))))
-
-
-def rao_distance_same_mean(family: Family, scatter: Array, other: Array) -> Array:
-    """Rao distance (24) of densities of one mean, scatters (..., m, m) -> (...)."""
-    mean_log, deviation = _log_ratio(scatter, other)
-    return np.asarray(np.sqrt(family.radius_squared * mean_log**2 + 2.0 * family.b * deviation**2))
-
-
-def rao_distance_same_shape(family: Family, mean: Array, scatter: Array, other_mean: Array, scale: Array) -> Array:
-    """Rao distance (26) from (mean, scatter) to (other_mean, scale * scatter).
-
-    Shapes (..., m), (..., m, m), (..., m), (...) -> (...). It is the distance among densities of this shape;
-    in several axes a way through other shapes is shorter. Under the root of (26) stands 2 a_h / c alone.
-    """
-    z = family.pull * mahalanobis_squared(mean - other_mean, scatter)
-    return np.asarray(np.sqrt(family.radius_squared) * acosh1p(_bend(z, np.log(scale))))
-
-
-def projection_distance(family: Family, mean: Array, scatter: Array, other_mean: Array) -> tuple[Array, Array]:
-    """Distance (32) to the densities of another mean and the scatter's own shape, and the factor (34) to the nearest.
-
-    Shapes (..., m), (..., m, m), (..., m).
-
-    Returns
-    -------
-    distance (...), scale (...)    the nearest has the scatter scale * scatter
-    """
-    z = family.pull * mahalanobis_squared(mean - other_mean, scatter)
-    return np.sqrt(family.radius_squared) * acosh1p(z), 1.0 + 0.5 * z
-
-
-def geodesic_projection_distance(family: Family, mean: Array, scatter: Array, other_mean: Array) -> Array:
-    """Least Rao distance to any density of another mean, (..., m), (..., m, m), (..., m) -> (...).
-
-    Notes         By symmetry the shortest path changes the scatter along the residual and, by one factor, across
-                  it; the end being free, the factor across is the one that costs least at every step, which
-                  leaves a hyperbolic plane with the constants g of `Family` and a perpendicular dropped to a line.
-    References    M. Tang et al., Information Geometric Approach to Multisensor Estimation Fusion, 2019 (Gaussian).
-    """
-    z = family.geodesic_pull * mahalanobis_squared(mean - other_mean, scatter)
-    return np.asarray(np.sqrt(family.geodesic_radius_squared) * acosh1p(z))
-
-
-def minimal_manhattan_distance(
-    family: Family, mean: Array, scatter: Array, other_mean: Array, other_scatter: Array
-) -> Array:
-    """Minimal Manhattan distance (27)-(28), an upper bound of the Rao distance; exact in one axis.
-
-    From (mean, scatter) to the other mean at a scaled scatter, then to the other scatter; not symmetric. Shapes
-    (..., m), (..., m, m), (..., m), (..., m, m) -> (...).
-    """
-    z = family.pull * mahalanobis_squared(mean - other_mean, scatter)
-    mean_log, deviation = _log_ratio(scatter, other_scatter)
-    shape = np.broadcast_shapes(np.shape(z), mean_log.shape)
-    flat = [np.broadcast_to(v, shape).ravel() for v in (z, mean_log, deviation, family.radius_squared, 2.0 * family.b)]
-    return manhattan_paths(*flat).length.reshape(shape)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,14 +85,6 @@ def _bend_slopes(z: Array, u: Array, side: Array) -> tuple[Array, Array]:
         slope = np.where(root > 0, rise / root, side)
         curvature = np.where(root > 0, (1.0 + bend - 0.5 * z - (1.0 + bend) * slope**2) / root, 0.0)
     return slope, curvature
-
-
-def _log_ratio(scatter: Array, other: Array) -> tuple[Array, Array]:
-    """Trace over m of Log(S^-1 S'), and the Frobenius norm of what is left of it."""
-    whiten = np.linalg.inv(np.linalg.cholesky(scatter))
-    logs = np.log(np.linalg.eigvalsh(symmetrise(whiten @ other @ transpose(whiten))))
-    mean_log = logs.mean(-1)
-    return mean_log, np.asarray(np.sqrt(((logs - mean_log[..., None]) ** 2).sum(-1)))
 
 
 # One axis: the densities are a hyperbolic plane, for which everything is known.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.log_domain import log_of, normalised
-from track_fusion.densities.mixture.mixture import LOG_2PI, Mixture
+from track_fusion.densities.mixture.mixture import LOG_2PI, Factored, Mixture
 from track_fusion.linalg import (
     Array,
     cholesky,
@@ -41,6 +41,11 @@ class LogMixture(NamedTuple):
     def normalised(self) -> Mixture:
         """The mixture with weights of sum one."""
         return Mixture(normalised(self.log_weight), self.mean, self.cov)
+
+    @property
+    def factored(self) -> Factored:
+        """The mixture to be evaluated at many points, its weights as they are."""
+        return Factored(self.log_weight, self.mean, whitener(self.cov))
 
     @classmethod
     def of(cls, mixture: Mixture) -> LogMixture:

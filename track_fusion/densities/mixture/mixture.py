@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.gaussian import merge
 from track_fusion.densities.log_domain import log_of, log_sum_exp
-from track_fusion.linalg import Array, cholesky, matvec, outer, symmetrise, transpose, whitener
+from track_fusion.linalg import Array, cholesky, matvec, merged_moments, outer, symmetrise, transpose, whitener
 
 LOG_2PI = float(np.log(2.0 * np.pi))
 #: Numbers in a temporary: larger ones leave the cache and, worse, are given back to the system each time.
@@ -39,11 +38,7 @@ class Mixture:
 
     def take(self, index: NDArray[np.intp]) -> Mixture:
         """Pick components (..., P) of each mixture by index."""
-        return Mixture(
-            np.take_along_axis(self.weight, index, -1),
-            np.take_along_axis(self.mean, index[..., None], -2),
-            np.take_along_axis(self.cov, index[..., None, None], -3),
-        )
+        return Mixture(*(take_components(a, index) for a in (self.weight, self.mean, self.cov)))
 
     def at(self, key: Any) -> Mixture:
         """Index the leading axes of all three arrays alike."""
@@ -58,10 +53,26 @@ class Mixture:
         )
 
 
+def take_components(array: NDArray[Any], index: NDArray[np.intp]) -> NDArray[Any]:
+    """Pick components (..., P) of an array (..., C, ...) by index."""
+    return np.take_along_axis(array, component_index(array, index), index.ndim - 1)
+
+
+def component_index(array: NDArray[Any], index: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Give an index (..., P) of components as many axes as an array (..., C, ...) has."""
+    return index.reshape(*index.shape, *(1,) * (array.ndim - index.ndim))
+
+
+def gaussian(mean: Array, cov: Array) -> Mixture:
+    """Return a Gaussian as a mixture (..., 1), cov (..., n, n) broadcast to mean (..., n)."""
+    cov = np.broadcast_to(cov, (*mean.shape, mean.shape[-1]))
+    return Mixture(np.ones((*mean.shape[:-1], 1)), mean[..., None, :], cov[..., None, :, :])
+
+
 def moments(mixture: Mixture) -> tuple[Array, Array]:
     """Mean (..., n) and covariance (..., n, n) of each mixture, its weights normalised first."""
     part = mixture.normalised
-    return merge(part.mean, part.cov, part.weight)
+    return merged_moments(part.mean, part.cov, part.weight)
 
 
 def log_pdf(mixture: Mixture, points: Array) -> Array:
@@ -94,10 +105,9 @@ class Factored:
     white: Array
 
     @classmethod
-    def of(cls, mixture: Mixture, log_weight: Array | None = None) -> Factored:
-        """Factor a mixture; `log_weight` (..., C) replaces its weights where they would underflow."""
-        white = whitener(mixture.cov)
-        return cls(log_of(mixture.weight) if log_weight is None else log_weight, mixture.mean, white)
+    def of(cls, mixture: Mixture) -> Factored:
+        """Factor a mixture."""
+        return cls(log_of(mixture.weight), mixture.mean, whitener(mixture.cov))
 
     @property
     def lead(self) -> tuple[int, ...]:
@@ -233,14 +243,13 @@ def padded(mixture: Mixture, count: int) -> Mixture:
     return Mixture(weight, mixture.mean[..., at, :], mixture.cov[..., at, :, :])
 
 
-def stacked(one: Mixture, other: Mixture) -> Mixture:
-    """Stack two mixtures (..., C1) and (..., C2) as sources (..., 2, C), the smaller padded."""
-    count = max(one.count, other.count)
-    pair = padded(one, count), padded(other, count)
+def stacked(*mixtures: Mixture) -> Mixture:
+    """Stack K mixtures (..., C_k) as sources (..., K, C), the smaller padded."""
+    each = [padded(mixture, max(m.count for m in mixtures)) for mixture in mixtures]
     return Mixture(
-        np.stack([m.weight for m in pair], -2),
-        np.stack([m.mean for m in pair], -3),
-        np.stack([m.cov for m in pair], -4),
+        np.stack([m.weight for m in each], -2),
+        np.stack([m.mean for m in each], -3),
+        np.stack([m.cov for m in each], -4),
     )
 
 

@@ -14,25 +14,23 @@ from numpy.typing import NDArray
 
 from track_fusion.densities.log_domain import log_mean_exp, log_sum_exp, normalised
 from track_fusion.densities.mixture.mixture import LOG_2PI, Factored, Mixture, sample
-from track_fusion.densities.mixture.quotient import Laplace, Quotient, laplace
+from track_fusion.densities.mixture.quotient import Laplace, Quotient
 from track_fusion.densities.mixture.sampling import Weighted, floored, single_shot_em
 from track_fusion.linalg import Array, cholesky, logdet, symmetrise, transpose, whitener
 
 
-def laplace_proposal(quotient: Quotient, inflation: float = 2.0, found: Laplace | None = None) -> Mixture:
+def laplace_proposal(part: Laplace, inflation: float = 2.0) -> Mixture:
     """Algorithm 4: a mixture to draw samples of a whole quotient from, by Laplace's approximation of its mixands.
 
     Parameters
     ----------
-    quotient : Quotient          (..., M) mixands, each integrable
-    inflation : float >= 1       factor on the covariances, for heavier tails
-    found : Laplace or None      the approximation, if known
+    part : Laplace           of (..., M) mixands, each integrable
+    inflation : float >= 1   factor on the covariances, for heavier tails
 
     Returns
     -------
     Mixture    (..., M), weights of sum 1: each mixand's own times its zeroth moment (49), which the paper omits
     """
-    part = laplace(quotient) if found is None else found
     return Mixture(normalised(part.log_moment), part.mean, inflation * part.cov)
 
 
@@ -55,8 +53,7 @@ def indirect_global_sampling(
     rng, count, floor        generator, number of samples in all, smallest covariance as in `single_shot_em`
     """
     points = sample(proposal, rng, count).points
-    weight, mean, cov = quotient.numerator
-    joint = Factored.of(Mixture(np.ones(weight.shape), mean, cov), weight).joint(points)
+    joint = quotient.numerator.factored.joint(points)
     below = quotient.log_denominator(points) + Factored.of(proposal).log_pdf(points)
     samples = Weighted(points, log_sum_exp(joint, -2) - below)
     return Global(single_shot_em(samples, quotient.numerator, floor, joint), samples)
@@ -89,24 +86,24 @@ def inflated_naive(
     return Proposal(quotient.numerator.mean, cov, np.ones((*cov.shape[:-2], 1)))
 
 
-def laplace_proposals(found: Laplace) -> Proposal:
+def laplace_proposals(part: Laplace) -> Proposal:
     """LAGIS (53): Laplace's approximation of each mixand."""
-    return Proposal(found.mean, found.cov, np.ones((*found.log_moment.shape, 1)))
+    return Proposal(part.mean, part.cov, np.ones((*part.log_moment.shape, 1)))
 
 
 #: Number of scales of the heavy-tailed proposal, and the range in which its largest lies.
 SCALES, LEAST_SPREAD, MOST_SPREAD = 5, 2.0, 8.0
 
 
-def heavy_tail(found: Laplace, wide: Array) -> Proposal:
+def heavy_tail(part: Laplace, wide: Array) -> Proposal:
     """Heavy tail (54): scales in geometric order from 1 up to the largest that `wide` (..., M, n, n) has of Laplace's.
 
     `wide` is the covariance of the Gaussian above the mixand, (55); the largest scale is clipped to [2, 8].
     """
-    white = whitener(found.cov)
+    white = whitener(part.cov)
     largest = np.linalg.eigvalsh(symmetrise(white @ wide @ transpose(white)))[..., -1]
     top = np.clip(largest, LEAST_SPREAD, MOST_SPREAD)
-    return Proposal(found.mean, found.cov, top[..., None] ** np.linspace(0.0, 1.0, SCALES))
+    return Proposal(part.mean, part.cov, top[..., None] ** np.linspace(0.0, 1.0, SCALES))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,8 +145,7 @@ def direct_local_sampling(
     local = Weighted(x, theta)
     mean, spread = local.moments()
     weight = log_weight + local.log_eta
-    found = Mixture(normalised(weight), mean, floored(spread, cov, floor))
-    return Local(found, local.ess, log_sum_exp(weight))
+    return Local(Mixture(normalised(weight), mean, floored(spread, cov, floor)), local.ess, log_sum_exp(weight))
 
 
 def _standard_normals(rng: np.random.Generator, sets: int, count: int, n: int) -> Array:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from track_fusion.densities.log_domain import log_of
 from track_fusion.densities.mixture.algebra import LogMixture, gaussian_quotient, power, product
-from track_fusion.densities.mixture.mixture import LOG_2PI, Factored, Mixture
+from track_fusion.densities.mixture.mixture import LOG_2PI, Factored, Mixture, component_index, take_components
 from track_fusion.linalg import SMALLEST_PIVOT, Array, cholesky, eliminate, matvec, symmetrise, transpose, whitener
 
 
@@ -46,13 +46,7 @@ class Quotient:
 
     def take(self, index: NDArray[np.intp]) -> Quotient:
         """Pick mixands (..., P) by index."""
-        weight, mean, cov = self.numerator
-        picked = LogMixture(
-            np.take_along_axis(weight, index, -1),
-            np.take_along_axis(mean, index[..., None], -2),
-            np.take_along_axis(cov, index[..., None, None], -3),
-        )
-        return dataclasses.replace(self, numerator=picked)
+        return dataclasses.replace(self, numerator=LogMixture(*(take_components(a, index) for a in self.numerator)))
 
 
 def exact_quotient(first: Mixture, second: Mixture, common: Mixture) -> Quotient:
@@ -169,8 +163,8 @@ def moment_matched(quotient: Quotient, mean: Array, cov: Array) -> tuple[LogMixt
     proper (..., M)    False where the quotient has no integral
     """
     numerator = quotient.numerator
-    found = gaussian_quotient(numerator.mean, numerator.cov, mean[..., None, :], cov[..., None, :, :])
-    return LogMixture(numerator.log_weight + found.log_scale, found.mean, found.cov), found.proper
+    parts = gaussian_quotient(numerator.mean, numerator.cov, mean[..., None, :], cov[..., None, :, :])
+    return LogMixture(numerator.log_weight + parts.log_scale, parts.mean, parts.cov), parts.proper
 
 
 class Laplace(NamedTuple):
@@ -230,11 +224,11 @@ def _climb(
             break
         if left <= centre.shape[-2] // 2:
             at = np.argsort(done, axis=-1, kind="stable")[..., :left]
-            some = _take(centre, at), _take(lower, at), _take(y, at), _take(damping, at)
-            rest = _climb(quotient, *some, steps - taken)
+            c, root, x, size = (take_components(a, at) for a in (centre, lower, y, damping))
+            rest = _climb(quotient, c, root, x, size, steps - taken)
             whole: tuple[NDArray[Any], ...] = (y, value, hessian, done)
             for array, part in zip(whole, rest, strict=True):
-                np.put_along_axis(array, _index(array, at), part, at.ndim - 1)
+                np.put_along_axis(array, component_index(array, at), part, at.ndim - 1)
             break
         trial = y + np.where(done, 0.0, damping)[..., None] * step
         new_value, new_gradient, new_hessian = _cost(quotient, centre, lower, trial)
@@ -244,14 +238,6 @@ def _climb(
         hessian = np.where(better[..., None, None], new_hessian, hessian)
         damping = np.where(better, np.minimum(2.0 * damping, 1.0), 0.5 * damping)
     return y, value, hessian, done
-
-
-def _index(array: NDArray[Any], at: NDArray[np.intp]) -> NDArray[np.intp]:
-    return at.reshape(*at.shape, *(1,) * (array.ndim - at.ndim))
-
-
-def _take(array: Array, at: NDArray[np.intp]) -> Array:
-    return np.take_along_axis(array, _index(array, at), at.ndim - 1)
 
 
 def _cost(quotient: Quotient, centre: Array, lower: Array, y: Array) -> tuple[Array, Array, Array]:

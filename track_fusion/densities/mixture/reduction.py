@@ -118,10 +118,10 @@ def _merge_pairs(mixture: Mixture, count: int, cost: Cost) -> Mixture:
         if left < COMPACT_AT * costs.shape[-1]:
             parts, costs, gone = _compacted(parts, costs, gone, left)
         _merge_cheapest(parts, costs, gone, n, cost)
-    found = Parts.of(_compacted(parts, costs, gone, count)[0], n)
-    cov = symmetrise(found.scatter / found.weight[..., None, None])
-    weight = np.where(found.weight > size * WEIGHTLESS, found.weight, 0.0)
-    mean = found.mean.reshape(*lead, count, n)
+    kept = Parts.of(_compacted(parts, costs, gone, count)[0], n)
+    cov = symmetrise(kept.scatter / kept.weight[..., None, None])
+    weight = np.where(kept.weight > size * WEIGHTLESS, kept.weight, 0.0)
+    mean = kept.mean.reshape(*lead, count, n)
     return Mixture(weight.reshape(*lead, count), mean, cov.reshape(*lead, count, n, n))
 
 

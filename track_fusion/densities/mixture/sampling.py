@@ -121,8 +121,8 @@ def _minimise(contrast: Array, base: Array, pull: Array) -> tuple[Array, NDArray
         mean = (share * c).sum(-1)
         return flat[rows] + mean, (share * (c - mean[:, None]) ** 2).sum(-1)
 
-    found = minimise_on_interval(derivatives, flat.size)
-    return found.weights.reshape(lead), found.converged.reshape(lead), found.iterations.reshape(lead)
+    least = minimise_on_interval(derivatives, flat.size)
+    return least.weights.reshape(lead), least.converged.reshape(lead), least.iterations.reshape(lead)
 
 
 class Learned(NamedTuple):
@@ -214,7 +214,7 @@ def single_shot_em(samples: Weighted, numerator: LogMixture, floor: float = 0.1,
     """
     parts = numerator.normalised
     if joint is None:
-        joint = Factored.of(parts, numerator.log_weight).joint(samples.points)
+        joint = numerator.factored.joint(samples.points)
     theta = normalised(samples.log_weight)
     top = joint.max(-2, keepdims=True)
     gamma = np.exp(joint - np.where(np.isfinite(top), top, 0.0))

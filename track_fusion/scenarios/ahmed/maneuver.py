@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from track_fusion.filters.gaussian_sum_modes import MixtureModes
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate, rmse
-from track_fusion.peers.peer import Fuse, Peer
+from track_fusion.peers import Fuse, Peer
 from track_fusion.rules.mixture_wep import MixtureWepParams
+from track_fusion.scenarios.ahmed import PAPER
 from track_fusion.scenarios.ahmed.platforms import (
     COMPONENTS,
     PLATFORMS,
@@ -29,7 +30,9 @@ from track_fusion.scenarios.ahmed.platforms import (
     truths,
 )
 from track_fusion.study.chart import Chart, Series, ellipse
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario, chosen
+from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Claim, Scenario
 
 IGS = MixtureWepParams(criterion="minimax_information_loss", method="igs", samples=1000, max_components=COMPONENTS)
 RULE_CHOICES = (
@@ -44,7 +47,7 @@ TWO_SIGMA = 2.0
 AROUND_STEP = 3
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "", steps: int = STEPS) -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "", steps: int = STEPS) -> Outcomes:
     """Track with every row: errors and variances, arrays by row.
 
     Returns
@@ -56,14 +59,14 @@ def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "", s
     table = {f"gsf-{choice.name}": choice for choice in RULE_CHOICES}
     rows = list(chosen(dict.fromkeys((CENTRE, ALONE, *table)), only))
     study = Study(runs, seed, steps, progress, len(rows))
-    samples = {"truth": study.truth}
+    outcomes = {"truth": study.truth}
     for row in rows:
         if row == CENTRE:
-            found = study.centralised()
+            columns = study.centralised()
         else:
-            found = study.platforms(fuse_modes(table[row], seed) if row in table else None)
-        samples |= {f"{row} {name}": values for name, values in found.items()}
-    return samples
+            columns = study.platforms(fuse_modes(table[row], seed) if row in table else None)
+        outcomes |= {f"{row} {name}": values for name, values in columns.items()}
+    return outcomes
 
 
 class Study:
@@ -81,16 +84,16 @@ class Study:
         self.seen, self.start = measurements(self.truth, runs, seed), prior(runs, seed)
         self._common: tuple[Platforms, Record] | None = None
 
-    def centralised(self) -> Samples:
+    def centralised(self) -> Outcomes:
         """Run the filter that sees everything."""
         record = Record(self.truth, 1)
         for step, modes in enumerate(centralised(self.start, self.seen, self.steps), 1):
             record.estimate(step, [modes.moments])
             self._tell(step)
         self._done += 1
-        return record.samples
+        return record.outcomes
 
-    def platforms(self, fuse: Fuse[MixtureModes] | None) -> Samples:
+    def platforms(self, fuse: Fuse[MixtureModes] | None) -> Outcomes:
         """Run the platforms, which fuse what they hear in some way, or never talk."""
         first = SCHEDULE.period - 1
         if self._common is None:
@@ -98,7 +101,7 @@ class Study:
         platforms, record = self._common  # nobody has talked yet
         _, record = self._follow(platforms, first + 1, self.steps, fuse, record)
         self._done += 1
-        return record.samples
+        return record.outcomes
 
     def _follow(
         self, platforms: Platforms, begin: int, end: int, fuse: Fuse[MixtureModes] | None, known: Record | None
@@ -119,13 +122,13 @@ class Study:
 
 
 class Record:
-    """Errors, variances and components of P platforms, as :func:`sample` returns them."""
+    """Errors, variances and components of P platforms, as :func:`simulate` returns them."""
 
     def __init__(self, truth: Array, platforms: int) -> None:
         runs, count, n = truth.shape
         self._truth = truth
         shape = (runs, platforms, count - 1, n)
-        self.samples: Samples = {
+        self.outcomes: Outcomes = {
             "error": np.empty(shape),
             "variance": np.empty(shape),
             "before": np.zeros((runs, platforms, (count - 1) // SCHEDULE.period, n)),
@@ -134,20 +137,20 @@ class Record:
 
     def copy(self) -> Record:
         """Go on from here without changing this."""
-        other = Record(self._truth, self.samples["error"].shape[1])
-        other.samples = {name: values.copy() for name, values in self.samples.items()}
+        other = Record(self._truth, self.outcomes["error"].shape[1])
+        other.outcomes = {name: values.copy() for name, values in self.outcomes.items()}
         return other
 
-    def estimate(self, step: int, found: Sequence[tuple[Array, Array]]) -> None:
+    def estimate(self, step: int, moments: Sequence[tuple[Array, Array]]) -> None:
         """Keep the moments (R, n), (R, n, n) of each platform."""
-        for p, (mean, cov) in enumerate(found):
-            self.samples["error"][:, p, step - 1] = mean - self._truth[:, step]
-            self.samples["variance"][:, p, step - 1] = np.diagonal(cov, axis1=-2, axis2=-1)
+        for p, (mean, cov) in enumerate(moments):
+            self.outcomes["error"][:, p, step - 1] = mean - self._truth[:, step]
+            self.outcomes["variance"][:, p, step - 1] = np.diagonal(cov, axis1=-2, axis2=-1)
 
     def fusion(self, step: int, covs: Sequence[Array]) -> None:
         """Keep the variances that each platform had before it fused."""
         for p, cov in enumerate(covs):
-            self.samples["before"][:, p, step // SCHEDULE.period - 1] = np.diagonal(cov, axis1=-2, axis2=-1)
+            self.outcomes["before"][:, p, step // SCHEDULE.period - 1] = np.diagonal(cov, axis1=-2, axis2=-1)
 
     def picture(self, densities: Sequence[MixtureModes]) -> None:
         """Keep the positions of each platform's components over all modes."""
@@ -156,20 +159,20 @@ class Record:
             part = density.marginal
             columns = (part.weight, part.mean[..., x], part.mean[..., y],
                        part.cov[..., x, x], part.cov[..., x, y], part.cov[..., y, y])  # fmt: skip
-            self.samples["components"][:, p, : part.count] = np.stack(columns, -1)
+            self.outcomes["components"][:, p, : part.count] = np.stack(columns, -1)
 
 
 # Figures.
 
 
-def norms(samples: Samples, row: str, axes: Sequence[int]) -> Array:
+def norms(outcomes: Outcomes, row: str, axes: Sequence[int]) -> Array:
     """Norm of the error over some axes, (R, P, T)."""
-    return np.asarray(np.sqrt((samples[f"{row} error"][..., axes] ** 2).sum(-1)))
+    return np.asarray(np.sqrt((outcomes[f"{row} error"][..., axes] ** 2).sum(-1)))
 
 
-def bounds(samples: Samples, row: str, axes: Sequence[int], name: str = "variance") -> Array:
+def bounds(outcomes: Outcomes, row: str, axes: Sequence[int], name: str = "variance") -> Array:
     """Two-sigma bound over some axes, (R, P, T): twice the root of the trace."""
-    return np.asarray(TWO_SIGMA * np.sqrt(samples[f"{row} {name}"][..., axes].sum(-1)))
+    return np.asarray(TWO_SIGMA * np.sqrt(outcomes[f"{row} {name}"][..., axes].sum(-1)))
 
 
 def fusions(values: Array) -> Array:
@@ -177,9 +180,9 @@ def fusions(values: Array) -> Array:
     return values[..., SCHEDULE.period - 1 :: SCHEDULE.period]
 
 
-def rows_of(samples: Samples) -> list[str]:
+def rows_of(outcomes: Outcomes) -> list[str]:
     """List the rows that were run."""
-    return [name.removesuffix(" error") for name in samples if name.endswith(" error")]
+    return [name.removesuffix(" error") for name in outcomes if name.endswith(" error")]
 
 
 def run_medians(values: Array) -> Estimate:
@@ -192,45 +195,45 @@ def run_means(values: Array | NDArray[np.bool_]) -> Estimate:
     return Estimate.mean(values.reshape(len(values), -1).mean(1))
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Errors right after the fusions and over all steps, how they scatter, what is claimed of them."""
-    found: dict[str, Estimate] = {}
-    for row in rows_of(samples):
-        position, velocity = norms(samples, row, POSITION), norms(samples, row, VELOCITY)
+    estimates: dict[str, Estimate] = {}
+    for row in rows_of(outcomes):
+        position, velocity = norms(outcomes, row, POSITION), norms(outcomes, row, VELOCITY)
         at_fusions = fusions(position)
-        found[f"{row}/median_position_error_m"] = run_medians(at_fusions)
-        found[f"{row}/median_velocity_error_mps"] = run_medians(fusions(velocity))
+        estimates[f"{row}/median_position_error_m"] = run_medians(at_fusions)
+        estimates[f"{row}/median_velocity_error_mps"] = run_medians(fusions(velocity))
         if position.shape[1] > 1:
             for p, name in enumerate(PLATFORMS):
-                found[f"{row}/median_position_error_p{name}_m"] = run_medians(at_fusions[:, p])
-        found[f"{row}/median_position_error_all_steps_m"] = run_medians(position)
-        found[f"{row}/median_velocity_error_all_steps_mps"] = run_medians(velocity)
-        found[f"{row}/share_inside_2_sigma_1"] = run_means(position < bounds(samples, row, POSITION))
-        found |= _of_fusion(samples, row)
-    return found
+                estimates[f"{row}/median_position_error_p{name}_m"] = run_medians(at_fusions[:, p])
+        estimates[f"{row}/median_position_error_all_steps_m"] = run_medians(position)
+        estimates[f"{row}/median_velocity_error_all_steps_mps"] = run_medians(velocity)
+        estimates[f"{row}/share_inside_2_sigma_1"] = run_means(position < bounds(outcomes, row, POSITION))
+        estimates |= _of_fusion(outcomes, row)
+    return estimates
 
 
-def _of_fusion(samples: Samples, row: str) -> dict[str, Estimate]:
+def _of_fusion(outcomes: Outcomes, row: str) -> dict[str, Estimate]:
     """Compare a row with the centralised one, with itself before the fusions, and with IGS at platform 2."""
-    found: dict[str, Estimate] = {}
+    estimates: dict[str, Estimate] = {}
     if row in (CENTRE, ALONE):
-        return found
-    bound = bounds(samples, row, POSITION)
-    shrunk = fusions(bound) < bounds(samples, row, POSITION, "before")
-    found[f"{row}/share_of_fusions_that_shrink_2_sigma_1"] = run_means(shrunk)
-    error = np.log10(fusions(norms(samples, row, POSITION))[:, 1])
+        return estimates
+    bound = bounds(outcomes, row, POSITION)
+    shrunk = fusions(bound) < bounds(outcomes, row, POSITION, "before")
+    estimates[f"{row}/share_of_fusions_that_shrink_2_sigma_1"] = run_means(shrunk)
+    error = np.log10(fusions(norms(outcomes, row, POSITION))[:, 1])
     if error.shape[1] > 1:
-        found[f"{row}/log10_position_error_sd_p2_1"] = Estimate.mean(error.std(1, ddof=1))
-    if f"{CENTRE} error" in samples:
-        above = bound > bounds(samples, CENTRE, POSITION)
-        found[f"{row}/share_of_steps_above_centralised_2_sigma_1"] = run_means(above)
-    if row != BY_IGS and f"{BY_IGS} error" in samples:
-        reference = np.log10(fusions(norms(samples, BY_IGS, POSITION))[:, 1])
-        found[f"{row}/log10_error_ratio_to_igs_p2_1"] = run_means(error - reference)
-    return found
+        estimates[f"{row}/log10_position_error_sd_p2_1"] = Estimate.mean(error.std(1, ddof=1))
+    if f"{CENTRE} error" in outcomes:
+        above = bound > bounds(outcomes, CENTRE, POSITION)
+        estimates[f"{row}/share_of_steps_above_centralised_2_sigma_1"] = run_means(above)
+    if row != BY_IGS and f"{BY_IGS} error" in outcomes:
+        reference = np.log10(fusions(norms(outcomes, BY_IGS, POSITION))[:, 1])
+        estimates[f"{row}/log10_error_ratio_to_igs_p2_1"] = run_means(error - reference)
+    return estimates
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Median position error over platforms and fusions, in metres, of each run (R,), for any rule for two tracks.
 
     Raises
@@ -238,12 +241,12 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
     ParameterError    a rule needs something beside the tracks
     """
     ways: dict[str, Fuse[MixtureModes]] = {f"gsf-{choice.name}": fuse_modes(choice, seed) for choice in rules}
-    study, found = Study(runs, seed, STEPS, progress, len(ways)), {}
+    study, errors_m = Study(runs, seed, STEPS, progress, len(ways)), {}
     for row, fuse in ways.items():
         errors = {f"{row} {name}": values for name, values in study.platforms(fuse).items()}
         at_fusions = fusions(norms(errors, row, POSITION))
-        found[f"{row}/median_position_error_m"] = np.median(at_fusions.reshape(len(runs), -1), 1)
-    return found
+        errors_m[f"{row}/median_position_error_m"] = np.median(at_fusions.reshape(len(runs), -1), 1)
+    return errors_m
 
 
 # Pictures.
@@ -251,16 +254,16 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
 LABELS = {CENTRE: "centralised", ALONE: "independent", BY_FOCI: "FOCI", BY_IGS: "IGS"}
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Redraw Figs. 10 to 15: ways, densities at step 180, errors with bounds over time, distributions."""
-    rows = rows_of(samples)
-    panels = [_map(samples["truth"][0])]
-    panels += [_components(samples, row) for row in rows if samples[f"{row} components"][0].any()]
+    rows = rows_of(outcomes)
+    panels = [_map(outcomes["truth"][0])]
+    panels += [_components(outcomes, row) for row in rows if outcomes[f"{row} components"][0].any()]
     for p, name in enumerate(PLATFORMS):
-        panels.append(_over_time(samples, rows, p, f"Platform {name}: position RMSE and 2-sigma bound", POSITION, "m"))
-    panels.append(_over_time(samples, rows, 1, "Platform 2: velocity RMSE and 2-sigma bound", VELOCITY, "m/s"))
+        panels.append(_over_time(outcomes, rows, p, f"Platform {name}: position RMSE and 2-sigma bound", POSITION, "m"))
+    panels.append(_over_time(outcomes, rows, 1, "Platform 2: velocity RMSE and 2-sigma bound", VELOCITY, "m/s"))
     for axis, label in ((POSITION[0], "east position error, m"), (VELOCITY[0], "east velocity error, m/s")):
-        panels.append(_distribution(samples, rows, axis, label))
+        panels.append(_distribution(outcomes, rows, axis, label))
     return panels
 
 
@@ -273,25 +276,25 @@ def _map(truth: Array) -> Chart:
     return Chart("Target and platforms", "east, km", "north, km", lines, equal=True)
 
 
-def _components(samples: Samples, row: str) -> Chart:
+def _components(outcomes: Outcomes, row: str) -> Chart:
     """Two-sigma ellipses of each platform's components that have a share of 1e-3 or more, first run."""
     lines = []
-    for name, parts in zip(PLATFORMS, samples[f"{row} components"][0], strict=True):
+    for name, parts in zip(PLATFORMS, outcomes[f"{row} components"][0], strict=True):
         heavy = parts[parts[:, 0] >= 1e-3]
         around = [ellipse("", c[1:3] / 1e3, c[[[3, 4], [4, 5]]] / 1e6, TWO_SIGMA) for c in heavy]
         x = np.concatenate([np.append(e.x[::AROUND_STEP], e.x[0]) for e in around])
         y = np.concatenate([np.append(e.y[::AROUND_STEP], np.nan) for e in around])  # NaN interrupts the line
         lines.append(Series(f"platform {name}", x, y))
-    target = samples["truth"][0, PICTURED] / 1e3
+    target = outcomes["truth"][0, PICTURED] / 1e3
     lines.append(Series("target", target[[POSITION[0]]], target[[POSITION[1]]], "points"))
     title = f"{LABELS[row]}: components at step {PICTURED}, 2 sigma"
     return Chart(title, "east, km", "north, km", tuple(lines), equal=True)
 
 
-def _over_time(samples: Samples, rows: Iterable[str], p: int, title: str, axes: Sequence[int], unit: str) -> Chart:
+def _over_time(outcomes: Outcomes, rows: Iterable[str], p: int, title: str, axes: Sequence[int], unit: str) -> Chart:
     lines = []
     for row in rows:
-        error, bound = norms(samples, row, axes), bounds(samples, row, axes)
+        error, bound = norms(outcomes, row, axes), bounds(outcomes, row, axes)
         at, steps = min(p, error.shape[1] - 1), np.arange(1, error.shape[2] + 1)
         lines.append(Series(LABELS[row], steps, rmse(error[:, at] ** 2)))
         if row in (BY_FOCI, BY_IGS):
@@ -299,11 +302,11 @@ def _over_time(samples: Samples, rows: Iterable[str], p: int, title: str, axes: 
     return Chart(title, "time, s", unit, tuple(lines), log_y=True)
 
 
-def _distribution(samples: Samples, rows: Iterable[str], axis: int, label: str) -> Chart:
+def _distribution(outcomes: Outcomes, rows: Iterable[str], axis: int, label: str) -> Chart:
     """Shares of runs and fusions with an error of platform 2 below x, right after the fusions."""
     lines = []
     for row in rows:
-        error = np.abs(samples[f"{row} error"][..., axis])
+        error = np.abs(outcomes[f"{row} error"][..., axis])
         values = np.sort(fusions(error[:, min(1, error.shape[1] - 1)]).ravel())
         lines.append(Series(LABELS[row], values, np.arange(1, len(values) + 1) / len(values), "steps"))
     return Chart(f"Platform 2 after fusions: {label.partition(',')[0]}", label, "share below", tuple(lines), log_x=True)
@@ -361,9 +364,8 @@ CLAIMS = (
 SCENARIO = Scenario(
     key="ahmed-maneuver",
     title="A manoeuvring target, three platforms that see ranges and talk once a minute around a ring",
-    paper="Ahmed, Decentralized Gaussian Mixture Fusion through Unified Quotient Approximations, 5.4",
+    paper=f"{PAPER}, 5.4",
     shows="what the weighted exponential product keeps of mixtures far from Gaussian when sampled (IGS) and by FOCI",
-    published={},
     published_runs=50,
     default_runs=5,
     publication_runs=10,
@@ -382,7 +384,7 @@ SCENARIO = Scenario(
         "the 2-sigma bound is twice the root of the trace of the position's or velocity's covariance",
         "figures are medians over runs: root-mean-square errors over all time are dominated by outliers",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=CLAIMS,

@@ -10,14 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.log_domain import normalised
-from track_fusion.densities.mixture.divergence import grid, kl_on_grid
-from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments, stacked
+from track_fusion.densities.mixture.mixture import Mixture, log_pdf, stacked
 from track_fusion.densities.mixture.quotient import exact_bound, exact_quotient
+from track_fusion.densities.on_grid import grid, kl_on_grid
 from track_fusion.linalg import Array, transpose
 from track_fusion.random_streams import stream
-from track_fusion.rules import RULES, FusedTracks, SourceTracks
+from track_fusion.rules import FusedTracks, SourceTracks
 from track_fusion.study.chart import Chart, Contours
-from track_fusion.study.scenario import Progress, RuleChoice, Samples, check_needs
+from track_fusion.study.rows import Outcomes, Progress, run_by_run
+from track_fusion.study.rule_choice import RuleChoice, check_needs
 
 #: Half the sides of the squares in which the sources' and the common information's means lie.
 SOURCE_HALF, COMMON_HALF = 14.0, 20.0
@@ -73,8 +74,7 @@ class Problem:
 
     def tracks(self, rng: np.random.Generator) -> SourceTracks:
         """Return what a rule takes; `rng` is for those that sample."""
-        both = stacked(self.first, self.second)
-        return SourceTracks(*moments(both), mixture=both, extras={"common": self.common, "seed": rng})
+        return SourceTracks.of(stacked(self.first, self.second), common=self.common, seed=rng)
 
     def log_exact(self, points: Array = GRID) -> Array:
         """Logarithm of the exactly fused density at points (S, 2), up to a constant: (6)."""
@@ -85,16 +85,9 @@ class Problem:
         return omega * log_pdf(self.first, points) + (1.0 - omega) * log_pdf(self.second, points)
 
 
-def divergence(log_truth: Array, log_fused: Array) -> float:
-    """Divergence in nats of densities given on GRID by their logarithms (CELLS^2,), each normalised there."""
-    return kl_on_grid(lambda x: log_truth, lambda x: log_fused, GRID)
-
-
 def log_fused(fused: FusedTracks) -> Array:
     """Logarithm on GRID of a fused density: its mixture, or the Gaussian of its moments."""
-    if fused.mixture is not None:
-        return log_pdf(fused.mixture, GRID)
-    return log_pdf(Mixture(np.ones(1), fused.mean[None], fused.cov[None]), GRID)
+    return log_pdf(fused.density, GRID)
 
 
 def shown(log_density: Array) -> NDArray[np.float32]:
@@ -137,7 +130,7 @@ def compare(
     runs: Sequence[int],
     seed: int,
     progress: Progress,
-) -> Samples:
+) -> Outcomes:
     """Fuse the problems draw(seed, run) by any rules: divergence of the exactly fused density from what each gives.
 
     Raises
@@ -145,12 +138,12 @@ def compare(
     ParameterError    a rule needs more beside the tracks than their common information
     """
     check_needs(rules, ("common",))
-    found: Samples = {f"given-{choice.name}/kld_nats": np.empty(len(runs)) for choice in rules}
-    for row, run in enumerate(runs):
+
+    def one(run: int, tell: Progress) -> dict[str, Array]:
         problem = draw(seed, run)
         truth = problem.log_exact()
-        for choice in rules:
-            fused = RULES[choice.key].fuse(problem.tracks(stream(seed, run, "fusion")), choice.params)
-            found[f"given-{choice.name}/kld_nats"][row] = divergence(truth, log_fused(fused))
-        progress((row + 1) / len(runs))
-    return found
+        fused = {choice.name: choice.fuse(problem.tracks(stream(seed, run, "fusion"))) for choice in rules}
+        tell(1.0)
+        return {f"given-{name}/kld_nats": kl_on_grid(truth, log_fused(tracks)) for name, tracks in fused.items()}
+
+    return run_by_run(runs, progress, one)

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
 
 from track_fusion.densities.log_domain import log_of, normalised
-from track_fusion.densities.mixture.mixture import Mixture, moments
+from track_fusion.densities.mixture.mixture import Mixture, moments, stacked
 from track_fusion.densities.mixture.reduction import prune, runnalls
-from track_fusion.filters import gaussian_sum_modes, interacting_multiple_model
-from track_fusion.filters.gaussian_sum_modes import MixtureModes
-from track_fusion.filters.interacting_multiple_model import Modes
+from track_fusion.filters.gaussian_sum_modes import GaussianSumModes, MixtureModes
+from track_fusion.filters.interacting_multiple_model import InteractingMultipleModel, Modes
+from track_fusion.filters.iterated_corrector import IteratedCorrector
 from track_fusion.linalg import Array
 from track_fusion.models.measurement import RangeRangeRateSensor
 from track_fusion.models.turn import KnownTurn, KnownTurnParams
-from track_fusion.peers.peer import Fuse, Peer, Schedule, communicate, gaussian, ring, sources
+from track_fusion.peers import Fuse, Peer, Schedule, communicate, ring
 from track_fusion.random_streams import stream
-from track_fusion.rules import RULES
-from track_fusion.study.scenario import RuleChoice, check_needs
+from track_fusion.rules import SourceTracks
+from track_fusion.study.rule_choice import RuleChoice, check_needs
+from track_fusion.trackers.fusion_loop import filtered
 from track_fusion.tracks import StateLayout
 
 LAYOUT = StateLayout(("x", "vx", "y", "vy"))
@@ -62,13 +62,13 @@ def truths(runs: Sequence[int], seed: int, steps: int = STEPS) -> Array:
 
 def measurements(states: Array, runs: Sequence[int], seed: int) -> dict[str, Array]:
     """Draw ranges and range rates at steps 1 to T, (R, T, 2) for each platform."""
-    found = {}
+    seen = {}
     for name, sensor in SENSORS.items():
         draws = np.stack(
             [stream(seed, run, f"platform {name}").standard_normal((states.shape[1] - 1, 2)) for run in runs]
         )
-        found[name] = sensor.observe(states[:, 1:]) + draws * np.sqrt(np.diagonal(sensor.noise))
-    return found
+        seen[name] = sensor.observe(states[:, 1:]) + draws * np.sqrt(np.diagonal(sensor.noise))
+    return seen
 
 
 def prior(runs: Sequence[int], seed: int) -> MixtureModes:
@@ -88,14 +88,18 @@ def reduce(mixture: Mixture, count: int) -> Mixture:
     return runnalls(prune(mixture, NEGLIGIBLE)[0], count)
 
 
+#: Moves by the old mode, then jumps; at most 12 components a mode.
+FILTER = GaussianSumModes(CHAIN, COMPONENTS, reduce)
+
+
 def predict(modes: MixtureModes) -> MixtureModes:
-    """Predict one step: move by the old mode, then jump, at most 12 components a mode."""
-    return gaussian_sum_modes.predict(modes, TRANSITIONS, CHAIN, COMPONENTS, reduce)
+    """Predict one step."""
+    return FILTER.predict(modes, TRANSITIONS)
 
 
 def update(modes: MixtureModes, z: Array, sensor: RangeRangeRateSensor) -> MixtureModes:
     """Condition on one platform's measurements (R, 2)."""
-    return gaussian_sum_modes.update(modes, z, sensor)[0]
+    return FILTER.update(modes, z, sensor)[0]
 
 
 def fuse_modes(choice: RuleChoice, seed: int) -> Fuse[MixtureModes]:
@@ -108,15 +112,12 @@ def fuse_modes(choice: RuleChoice, seed: int) -> Fuse[MixtureModes]:
     ParameterError    the rule needs something beside two tracks
     """
     check_needs([choice])
-    rule = RULES[choice.key]
 
     def fuse(own: MixtureModes, heard: MixtureModes, common: MixtureModes | None, count: int) -> MixtureModes:
-        extras = {"seed": np.random.default_rng([seed, count])} if "seed" in rule.optional else {}
-        tracks = dataclasses.replace(sources(own.mixture, heard.mixture), extras=extras)
-        fused = rule.fuse(tracks, choice.params)
+        extras = {"seed": np.random.default_rng([seed, count])} if "seed" in choice.rule.optional else {}
+        fused = choice.fuse(SourceTracks.of(stacked(own.mixture, heard.mixture), **extras))
         log_eta = fused.info.get("log_eta", np.zeros(own.probability.shape))
-        mixture = gaussian(fused.mean, fused.cov) if fused.mixture is None else fused.mixture
-        return MixtureModes(normalised(log_of(own.probability) + log_eta), mixture)
+        return MixtureModes(normalised(log_of(own.probability) + log_eta), fused.density)
 
     return fuse
 
@@ -141,10 +142,8 @@ def follow(
 
 
 def centralised(start: MixtureModes, seen: Mapping[str, Array], steps: int) -> Iterator[Modes]:
-    """Yield one Gaussian a mode that has seen all three platforms' measurements."""
+    """One Gaussian a mode, step by step, that has seen all three platforms' measurements."""
+    one = IteratedCorrector(InteractingMultipleModel(CHAIN, jump_first=False))
+    scans = ([seen[name][:, step] for name in SENSORS] for step in range(steps))
     modes = Modes(start.probability, *moments(start.mixture))
-    for step in range(steps):
-        modes = interacting_multiple_model.predict(modes, TRANSITIONS, CHAIN, jump_first=False)
-        for name, sensor in SENSORS.items():
-            modes, _ = interacting_multiple_model.update(modes, seen[name][:, step], sensor)
-        yield modes
+    return filtered(one, modes, TRANSITIONS, scans, list(SENSORS.values()))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from track_fusion.densities.log_domain import log_sum_exp, normalised
-from track_fusion.densities.mixture.mixture import Factored, Mixture, log_pdf
+from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.densities.mixture.proposals import (
     Proposal,
     direct_local_sampling,
@@ -26,10 +26,12 @@ from track_fusion.densities.mixture.quotient import (
     exact_quotient,
     laplace,
 )
+from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.params import from_dict
 from track_fusion.random_streams import stream
 from track_fusion.rules import RULES
+from track_fusion.scenarios.ahmed import PAPER
 from track_fusion.scenarios.ahmed.mixtures import (
     CELL_AREA,
     GRID,
@@ -37,11 +39,12 @@ from track_fusion.scenarios.ahmed.mixtures import (
     Problem,
     compare,
     contour_chart,
-    divergence,
     shown,
 )
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.scenario import Claim, Printed, Progress, RuleChoice, Samples, Scenario, chosen
+from track_fusion.study.rows import Outcomes, Progress, chosen, run_by_run
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Claim, Printed, Scenario
 
 #: Fig. 7: divergence in nats of the true fused density from each approximation, one problem.
 FIGURE_7 = {
@@ -86,8 +89,7 @@ class Case:
         self.quotient: Quotient = exact_quotient(*parts)
         self.bound: Bound = exact_bound(self.quotient, self.problem.common)
         self.laplace: Laplace = laplace(self.quotient)
-        weight, mean, cov = self.quotient.numerator
-        joint = Factored.of(Mixture(np.ones(weight.shape), mean, cov), weight).joint(GRID)
+        joint = self.quotient.numerator.factored.joint(GRID)
         #: Logarithm of the un-normalised mixands on the grid, (M, S), and of their integrals, (M,).
         self.log_mixands = joint - log_pdf(self.problem.common, GRID)
         self.log_weight = log_sum_exp(self.log_mixands) + np.log(CELL_AREA)
@@ -115,9 +117,9 @@ class Case:
                 "ess_1": float(share.mean()),
                 "weighted_ess_1": float(share @ normalised(self.log_weight)),
             }
-        found = log_pdf(fused, GRID)
-        pictures = {"density": shown(found), "truth": shown(truth)}
-        return {"kld_nats": divergence(truth, found)} | values | pictures
+        approximation = log_pdf(fused, GRID)
+        pictures = {"density": shown(approximation), "truth": shown(truth)}
+        return {"kld_nats": kl_on_grid(truth, approximation)} | values | pictures
 
     def _bounded(self) -> dict[str, Any]:
         bound, share = self.bound.log_weight, normalised(self.log_weight)
@@ -136,7 +138,7 @@ class Case:
         }
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Sample one problem a run from the proposals of the rows that start with `only`.
 
     Returns
@@ -144,56 +146,57 @@ def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -
     {row/quantity: (R,)}, and row/mixands (R, M): shares of effective samples, or of bound: logarithms of the bounds
     beside the true weights; row/density, row/truth (R, P, P) for pictures
     """
-    rows, found = chosen(ROWS, only), dict[str, list[Any]]()
-    for at, run in enumerate(runs):
+    rows = chosen(ROWS, only)
+
+    def one(run: int, tell: Progress) -> dict[str, Any]:
         case = Case(seed, run)
-        for name, row in rows.items():
-            for quantity, value in case.measure(row).items():
-                found.setdefault(f"{name}/{quantity}", []).append(value)
-        progress((at + 1) / len(runs))
-    return {name: np.array(values) for name, values in found.items()}
+        values = {f"{name}/{q}": value for name, row in rows.items() for q, value in case.measure(row).items()}
+        tell(1.0)
+        return values
+
+    return run_by_run(runs, progress, one)
 
 
 def _row(variant: str, quantity: str) -> str:
     return f"given-mixture_exact@{variant}/{quantity}"
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Medians of divergences and of looseness over the problems, means of all else; comparisons of the proposals."""
-    found = {}
-    for name, values in samples.items():
+    measured = {}
+    for name, values in outcomes.items():
         if values.ndim == 1:
             average = Estimate.median if name.endswith("_nats") else Estimate.mean
-            found[name] = average(values)
-    ess = {proposal: samples.get(_row(proposal, "mixands")) for proposal in PROPOSALS}
+            measured[name] = average(values)
+    ess = {proposal: outcomes.get(_row(proposal, "mixands")) for proposal in PROPOSALS}
     naive, local, heavy = ess.values()
     if naive is not None and local is not None and heavy is not None:
-        found[_row("ingis", "beaten_1")] = Estimate.mean((np.maximum(local, heavy) > naive).mean(1))
-        found[_row("heavy_tail", "below_lagis_1")] = Estimate.mean((heavy < local).mean(1))
-    return found
+        measured[_row("ingis", "beaten_1")] = Estimate.mean((np.maximum(local, heavy) > naive).mean(1))
+        measured[_row("heavy_tail", "below_lagis_1")] = Estimate.mean((heavy < local).mean(1))
+    return measured
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Fig. 7 and Fig. 8 for the first problem, and effective samples over all problems."""
-    return [*_densities(samples), *_first_mixands(samples), *_all_mixands(samples)]
+    return [*_densities(outcomes), *_first_mixands(outcomes), *_all_mixands(outcomes)]
 
 
-def _densities(samples: Samples) -> Iterator[Chart]:
+def _densities(outcomes: Outcomes) -> Iterator[Chart]:
     for variant in ROWS.values():
-        density = samples.get(_row(variant, "density"))
+        density = outcomes.get(_row(variant, "density"))
         if density is not None:
-            pictures = {"true density": samples[_row(variant, "truth")][0], variant: density[0]}
+            pictures = {"true density": outcomes[_row(variant, "truth")][0], variant: density[0]}
             yield contour_chart(f"First problem, 16 mixands: {variant.replace('_', ' ')}", pictures)
-    heaviest = samples.get(_row("bound", "heaviest"))
+    heaviest = outcomes.get(_row("bound", "heaviest"))
     if heaviest is not None:
         yield contour_chart("First problem: its heaviest mixand", {"true density": heaviest[0]})
 
 
-def _first_mixands(samples: Samples) -> Iterator[Chart]:
-    ess = [(p, samples[_row(p, "mixands")][0]) for p in PROPOSALS if _row(p, "mixands") in samples]
+def _first_mixands(outcomes: Outcomes) -> Iterator[Chart]:
+    ess = [(p, outcomes[_row(p, "mixands")][0]) for p in PROPOSALS if _row(p, "mixands") in outcomes]
     lines = [Series(proposal, np.arange(1.0, len(share) + 1), share, "points") for proposal, share in ess]
-    if _row("bound", "mixands") in samples:
-        bound, true = (samples[_row("bound", name)][0] for name in ("mixands", "true_mixands"))
+    if _row("bound", "mixands") in outcomes:
+        bound, true = (outcomes[_row("bound", name)][0] for name in ("mixands", "true_mixands"))
         at, top = np.arange(1.0, len(bound) + 1), log_sum_exp(true)
         if lines:
             lines.append(Series("true weight", at, np.exp(true - top), "bars"))
@@ -203,12 +206,12 @@ def _first_mixands(samples: Samples) -> Iterator[Chart]:
         yield Chart("First problem: effective samples", "mixand", "share of 500 samples", tuple(lines))
 
 
-def _all_mixands(samples: Samples) -> Iterator[Chart]:
+def _all_mixands(outcomes: Outcomes) -> Iterator[Chart]:
     shares = np.linspace(0.0, 1.0, 101)
     lines = [
-        Series(p, shares, (samples[_row(p, "mixands")].reshape(-1, 1) < shares).mean(0))
+        Series(p, shares, (outcomes[_row(p, "mixands")].reshape(-1, 1) < shares).mean(0))
         for p in PROPOSALS
-        if _row(p, "mixands") in samples
+        if _row(p, "mixands") in outcomes
     ]
     if lines:
         yield Chart(
@@ -263,10 +266,9 @@ CLAIMS = (
 SCENARIO = Scenario(
     key="ahmed-proposals",
     title="What the mixands of a quotient of mixtures are sampled from",
-    paper="Ahmed, Decentralized Gaussian Mixture Fusion through Unified Quotient Approximations, 5.2",
+    paper=f"{PAPER}, 5.2",
     shows="how many of its samples each proposal makes effective, and how tight the bound on a mixand's weight is",
     published={f"{row}/kld_nats": value for row, value in FIGURE_7.items()},
-    published_runs=1,
     default_runs=200,
     publication_runs=500,
     assumptions=(
@@ -280,7 +282,7 @@ SCENARIO = Scenario(
         "the true density, its mixands and their weights are taken on a grid of 100 x 100 cells over +-28",
         "share of effective samples: ess averages over the mixands alike, weighted_ess by their true weights",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=CLAIMS,

@@ -5,26 +5,29 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.params import from_dict
 from track_fusion.random_streams import stream
 from track_fusion.rules import RULES, FusedTracks
+from track_fusion.scenarios.ahmed import PAPER
 from track_fusion.scenarios.ahmed.mixtures import (
     INGIS_VARIANCE,
     Problem,
     compare,
     contour_chart,
-    divergence,
     log_fused,
     shown,
 )
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.scenario import Claim, Printed, Progress, RuleChoice, Samples, Scenario, chosen
+from track_fusion.study.rows import Outcomes, Progress, chosen, run_by_run
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Claim, Printed, Scenario
 
 #: Figs. 4 and 5, one problem: divergence in nats of the true fused density from each approximation.
 FIGURES_4_5 = {
@@ -108,30 +111,22 @@ def example_problem(seed: int, run: int) -> Problem:
     return Problem.drawn(stream(seed, run, "example"), *EXAMPLE)
 
 
-class Timed(NamedTuple):
-    """What a rule gives, and the processor time it took."""
-
-    fused: FusedTracks
-    took_s: float
-
-
 class Case:
     """A problem with what is to be known of it once: true densities, the times of the quickest methods."""
 
     def __init__(self, problem: Problem, seed: int, run: int) -> None:
         self.problem, self.seed, self.run = problem, seed, run
 
-    def fuse(self, choice: RuleChoice) -> Timed:
-        """Fuse by a rule, whose random numbers are the same for every rule."""
+    def fuse(self, choice: RuleChoice) -> tuple[FusedTracks, float]:
+        """Fuse by a rule, whose random numbers are the same for every rule; the processor time it took, in seconds."""
         tracks = self.problem.tracks(stream(self.seed, self.run, "fusion"))
         began = time.process_time()
-        fused = RULES[choice.key].fuse(tracks, choice.params)
-        return Timed(fused, time.process_time() - began)
+        return choice.fuse(tracks), time.process_time() - began
 
     @functools.cached_property
     def log_truth(self) -> dict[str, Array]:
         """Logarithm of the true fused density on the grid, by rule."""
-        weights = self.fuse(_choice("mixture_wep", "", method="foci")).fused.weights
+        weights = self.fuse(_choice("mixture_wep", "", method="foci"))[0].weights
         assert weights is not None
         omega = float(weights[0])
         return {"mixture_exact": self.problem.log_exact(), "mixture_wep": self.problem.log_wep(omega)}
@@ -139,19 +134,19 @@ class Case:
     @functools.cached_property
     def quickest_s(self) -> dict[str, float]:
         """Time of the quickest method, by rule."""
-        return {key: self.fuse(_choice(key, "", method=method)).took_s for key, method in QUICKEST.items()}
+        return {key: self.fuse(_choice(key, "", method=method))[1] for key, method in QUICKEST.items()}
 
     def measure(self, choice: RuleChoice) -> dict[str, Any]:
         """Quantities of one row of figures."""
         fused, took_s = self.fuse(choice)
-        truth, found = self.log_truth[choice.key], log_fused(fused)
-        values: dict[str, Any] = {"kld_nats": divergence(truth, found)}
+        truth, approximation = self.log_truth[choice.key], log_fused(fused)
+        values: dict[str, Any] = {"kld_nats": kl_on_grid(truth, approximation)}
         drawn = _samples_of(choice)
         if drawn:
             values["effective_samples_1"] = drawn * float(fused.info["ess"])
         values["time_ratio_1"] = took_s / self.quickest_s[choice.key]
         if f"given-{choice.name}/density" in PICTURES:
-            values |= {"density": shown(found), "truth": shown(truth)}
+            values |= {"density": shown(approximation), "truth": shown(truth)}
         return values
 
 
@@ -162,41 +157,44 @@ def _samples_of(choice: RuleChoice) -> int:
     return int(getattr(params, names[method])) if method in names else 0
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Fuse a problem a run by the methods whose rows start with `only`: divergence, effective samples, time, (R,).
 
     Notes    Times, `.../time_ratio_1`, are measured by the clock: they alone differ from one call to the next.
     """
-    rows, found = chosen(ROWS, only), dict[str, list[Any]]()
-    for at, run in enumerate(runs):
+    rows = chosen(ROWS, only)
+
+    def one(run: int, tell: Progress) -> dict[str, Any]:
         study, example = Case(study_problem(seed, run), seed, run), Case(example_problem(seed, run), seed, run)
-        for done, (name, choice) in enumerate(rows.items()):
+        outcomes: dict[str, Any] = {}
+        for done, (name, choice) in enumerate(rows.items(), 1):
             case = example if choice.variant.startswith("example") else study
-            for quantity, value in case.measure(choice).items():
-                found.setdefault(f"{name}/{quantity}", []).append(value)
-            progress((at + (done + 1) / len(rows)) / len(runs))
-    return {name: np.array(values) for name, values in found.items()}
+            outcomes |= {f"{name}/{quantity}": value for quantity, value in case.measure(choice).items()}
+            tell(done / len(rows))
+        return outcomes
+
+    return run_by_run(runs, progress, one)
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Medians over the problems."""
-    return {name: Estimate.median(values) for name, values in samples.items() if values.ndim == 1}
+    return {name: Estimate.median(values) for name, values in outcomes.items() if values.ndim == 1}
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Divergence by method over all problems, Fig. 6; the first example's densities, Figs. 4 and 5."""
-    return [*_divergences(samples), *_densities(samples)]
+    return [*_divergences(outcomes), *_densities(outcomes)]
 
 
-def _divergences(samples: Samples) -> Iterator[Chart]:
+def _divergences(outcomes: Outcomes) -> Iterator[Chart]:
     for key, title in (("mixture_exact", "Exact fusion"), ("mixture_wep", "WEP fusion")):
         start = f"given-{key}@"
-        names = [n for n in samples if n.startswith(start) and n.endswith("/kld_nats") and "@example" not in n]
+        names = [n for n in outcomes if n.startswith(start) and n.endswith("/kld_nats") and "@example" not in n]
         if not names:
             continue
         at = np.arange(len(names), dtype=float)
-        each = np.array([samples[n][:SHOWN_PROBLEMS] for n in names])
-        median = np.array([np.median(samples[n]) for n in names])
+        each = np.array([outcomes[n][:SHOWN_PROBLEMS] for n in names])
+        median = np.array([np.median(outcomes[n]) for n in names])
         ticks = {x: n.removeprefix(start).removesuffix("/kld_nats") for x, n in zip(at, names, strict=True)}
         family = [n.rstrip("0123456789") for n in ticks.values()]
         breaks = [i for i in range(1, len(names)) if family[i] != family[i - 1]]
@@ -207,13 +205,13 @@ def _divergences(samples: Samples) -> Iterator[Chart]:
         yield Chart(f"{title}: divergence from the truth", "method and samples", "nats", lines, log_y=True, ticks=ticks)
 
 
-def _densities(samples: Samples) -> Iterator[Chart]:
+def _densities(outcomes: Outcomes) -> Iterator[Chart]:
     for density, name in PICTURES.items():
-        if density in samples:
+        if density in outcomes:
             key, _, method = name.removeprefix("given-").partition("@example_")
             method = method.upper().replace("_", " with ")
             title = f"{'Exact' if key == 'mixture_exact' else 'WEP'} fusion, first example: {method}"
-            pictures = {"true density": samples[f"{name}/truth"][0], method: samples[density][0]}
+            pictures = {"true density": outcomes[f"{name}/truth"][0], method: outcomes[density][0]}
             yield contour_chart(title, pictures)
 
 
@@ -228,12 +226,13 @@ def _claims() -> Iterator[Claim]:
         figure, rough = ("Fig. 6(a)", "mmgd") if kind == "exact" else ("Fig. 6(b)", "foci")
         yield Claim.order(f"{kind} fusion by DLS improves with the samples", figure, *_names(key, *reversed(dls)))
         yield Claim.order(f"{kind} fusion by IGS improves with the samples", figure, *_names(key, *reversed(igs)))
-        yield Claim(
+        yield Claim.each(
             f"{kind} fusion: DLS is more accurate than IGS in nearly all cases (judged: in the median at each of the "
             "four numbers of samples)",
             figure,
-            _names(key, *dls, *igs),
-            lambda *all_: all(a.value < b.value for a, b in zip(all_[:4], all_[4:], strict=True)),
+            _names(key, *dls),
+            _names(key, *igs),
+            float.__lt__,
         )
         yield Claim(
             f"{kind} fusion: DLS and IGS improve on {rough.upper()} (judged: with each of their numbers of samples)",
@@ -260,19 +259,13 @@ def _claims() -> Iterator[Claim]:
         )
 
 
-def _published() -> dict[str, float]:
-    found: dict[str, float] = {f"{row}/kld_nats": value for row, value in FIGURES_4_5.items()}
-    found |= {f"{row}/effective_samples_1": value for row, value in EFFECTIVE_SAMPLES.items()}
-    return found
-
-
 SCENARIO = Scenario(
     key="ahmed-random",
     title="Random Gaussian mixtures, fused exactly and by weighted exponential products",
-    paper="Ahmed, Decentralized Gaussian Mixture Fusion through Unified Quotient Approximations, 5.1",
+    paper=f"{PAPER}, 5.1",
     shows="how near each way of dividing mixtures comes to the true fused density, by its number of samples",
-    published=_published(),
-    published_runs=1,
+    published={f"{row}/kld_nats": value for row, value in FIGURES_4_5.items()}
+    | {f"{row}/effective_samples_1": value for row, value in EFFECTIVE_SAMPLES.items()},
     default_runs=20,
     publication_runs=20,
     assumptions=(
@@ -293,7 +286,7 @@ SCENARIO = Scenario(
         "times are processor times of one problem, in those of MMGD (exact) or of the naive product (WEP) for the same "
         "problem: they differ from machine to machine and from call to call, and are the only figures that do",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=tuple(_claims()),

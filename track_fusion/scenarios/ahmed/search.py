@@ -5,26 +5,28 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
 from track_fusion.densities.log_domain import normalised
-from track_fusion.densities.mixture.divergence import grid
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.densities.mixture.reduction import prune, runnalls
-from track_fusion.filters import negative_information
+from track_fusion.densities.on_grid import grid, kl_on_grid
+from track_fusion.filters.negative_information import NegativeInformation
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.models.detection import SoftmaxDetector
 from track_fusion.params import ParameterError
-from track_fusion.peers.peer import Fuse, Peer, by_rule, communicate, on_tree, star, sweep
+from track_fusion.peers import Fuse, Peer, by_rule, communicate, on_tree, star, sweep
 from track_fusion.random_streams import stream
-from track_fusion.rules import RULES
 from track_fusion.rules.mixture_exact import MixtureExactParams
 from track_fusion.rules.mixture_wep import MixtureWepParams
-from track_fusion.study.chart import Chart, Contours, Series
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario, chosen
+from track_fusion.scenarios.ahmed import PAPER
+from track_fusion.study.chart import Chart, Contours, Series, bars
+from track_fusion.study.rows import Outcomes, Progress, chosen, run_by_run
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Claim, Scenario
 from track_fusion.tracks import StateLayout
 
 #: Text of 5.3 and caption of Fig. 9: divergence of robot 3's fused mixture from the centralised one.
@@ -47,7 +49,7 @@ HUB = "3"
 LINKS = star(HUB, [name for name in ROBOTS if name != HUB])
 NO_DETECTION = np.array([0.0, 1.0, 1.0, 1.0])
 #: Points for the moments of a component cut by a view cone, and below which relative variation it is not cut.
-FILTER_SAMPLES, UNCUT = 256, 0.1
+FILTER = NegativeInformation(samples=256, negligible=0.1)
 #: Components below this share are dropped before Runnalls' merging.
 NEGLIGIBLE = 1e-9
 
@@ -56,15 +58,15 @@ HALF_GRID_M, GRID = 7.0, 160
 POINTS = grid(np.full(2, -HALF_GRID_M), np.full(2, HALF_GRID_M), GRID)
 NEAR_M = 1.5
 
-PAPER = MixtureExactParams(
+DLS = MixtureExactParams(
     method="dls", proposal="ingis", default_variance=0.5, mixand_samples=500, max_components=COMPONENTS,
     not_integrable="skip",
 )  # fmt: skip
 RULE_CHOICES = (
-    RuleChoice("mixture_exact", PAPER),
-    RuleChoice("mixture_exact", dataclasses.replace(PAPER, proposal="heavy_tail"), "heavy_tail"),
-    RuleChoice("mixture_exact", dataclasses.replace(PAPER, method="igs", samples=2000), "igs"),
-    RuleChoice("mixture_exact", dataclasses.replace(PAPER, method="mmgd"), "mmgd"),
+    RuleChoice("mixture_exact", DLS),
+    RuleChoice("mixture_exact", dataclasses.replace(DLS, proposal="heavy_tail"), "heavy_tail"),
+    RuleChoice("mixture_exact", dataclasses.replace(DLS, method="igs", samples=2000), "igs"),
+    RuleChoice("mixture_exact", dataclasses.replace(DLS, method="mmgd"), "mmgd"),
     RuleChoice("mixture_wep", MixtureWepParams(method="dls", max_components=COMPONENTS)),
     RuleChoice("mixture_wep", MixtureWepParams(method="naive_bayes", max_components=COMPONENTS), "naive_bayes"),
 )
@@ -95,9 +97,7 @@ def searched(start: Mixture, robots: Iterable[str]) -> Mixture:
     robots, mixture = tuple(robots), start
     for step in range(1, STEPS + 1):
         for robot in robots:
-            mixture, _ = negative_information.update(
-                mixture, cone(robot, step), NO_DETECTION, FILTER_SAMPLES, negligible=UNCUT
-            )
+            mixture, _ = FILTER.update(mixture, NO_DETECTION, cone(robot, step))
             mixture = runnalls(prune(mixture, NEGLIGIBLE)[0], COMPONENTS)
     return mixture
 
@@ -119,9 +119,8 @@ def fused(choice: RuleChoice, start: Mixture, local: Mapping[str, Mixture], seed
 
 
 def _fuse(choice: RuleChoice, seed: int) -> tuple[Fuse[Mixture], bool]:
-    rule = RULES[choice.key]
     try:
-        return by_rule(rule, choice.params, seed), "common" in rule.needed(choice.params)
+        return by_rule(choice.rule, choice.params, seed), "common" in choice.rule.needed(choice.params)
     except ValueError as error:
         raise ParameterError(f"The rule must be one for peers: {error}") from error
 
@@ -132,78 +131,65 @@ def quotient(start: Mixture, local: Mapping[str, Mixture]) -> Array:
     return np.asarray(total - len(LINKS) * log_pdf(start, POINTS))
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+class Search:
+    """One run: its prior, what robots that saw everything or only their own views make of it, (1, ...) each."""
+
+    def __init__(self, run: int, seed: int, progress: Progress) -> None:
+        self.seed, self.start, self._progress = seed, prior([run], seed), progress
+        self.centre = log_pdf(searched(self.start, ROBOTS), POINTS)
+        progress(0.25)
+
+    @cached_property
+    def local(self) -> dict[str, Mixture]:
+        """Each robot's mixture before anybody talks."""
+        local = {}
+        for done, robot in enumerate(ROBOTS, 1):
+            local[robot] = searched(self.start, [robot])
+            self._progress(0.25 + 0.25 * done / len(ROBOTS))
+        return local
+
+    def fused(self, choice: RuleChoice) -> Array:
+        """Log of robot 3's mixture after fusion on the grid."""
+        return log_pdf(fused(choice, self.start, self.local, self.seed), POINTS)
+
+
+#: What gives each row's density on the grid.
+ROWS: dict[str, Callable[[Search], Array]] = {
+    CENTRE: lambda search: search.centre,
+    ALONE: lambda search: log_pdf(search.local[HUB], POINTS),
+    **{f"gm-{choice.name}": partial(Search.fused, choice=choice) for choice in RULE_CHOICES},
+    QUOTIENT: lambda search: quotient(search.start, search.local),
+}
+
+
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Search with these jittered priors: per row the divergences, (R,), the mass near the target, and the density.
 
     Notes    Run by run: which components are cut and merged differs from run to run, so a batch saves no time, and
              its rounding may decide which are.
     """
-    table = {f"gm-{c.name}": c for c in RULE_CHOICES}
-    rows = chosen(dict.fromkeys((CENTRE, ALONE, *table, QUOTIENT)), only)
-    return _run_by_run(lambda run, tell: _one_run(run, seed, list(rows), table, tell), runs, progress)
+    rows = chosen(ROWS, only)
+
+    def one(run: int, tell: Progress) -> Outcomes:
+        search = Search(run, seed, tell)
+        truth = bayes(search.start)
+        outcomes = {"prior": _thinned(log_pdf(search.start, POINTS)), "bayes": _thinned(truth)}
+        for done, (row, density) in enumerate(rows.items(), 1):
+            outcomes |= _measured(row, density(search), search.centre, truth)
+            tell(0.5 + 0.5 * done / len(rows))
+        return {name: values[0] for name, values in outcomes.items()}
+
+    return run_by_run(runs, progress, one)
 
 
-def _run_by_run(one: Callable[[int, Progress], Samples], runs: Sequence[int], progress: Progress) -> Samples:
-    """Join the samples of single runs."""
-    found = []
-    for done, run in enumerate(runs):
-        found.append(one(run, partial(_share, progress, done, len(runs))))
-    return {name: np.concatenate([samples[name] for samples in found]) for name in found[0]}
-
-
-def _share(progress: Progress, done: int, count: int, share: float) -> None:
-    progress((done + share) / count)
-
-
-def _one_run(run: int, seed: int, rows: Sequence[str], table: Mapping[str, RuleChoice], progress: Progress) -> Samples:
-    start = prior([run], seed)
-    centre, truth = log_pdf(_searched_by_all(start, progress), POINTS), bayes(start)
-    local = _searched_by_each(start, progress) if set(rows) != {CENTRE} else {}
-    samples = {"prior": _thinned(log_pdf(start, POINTS)), "bayes": _thinned(truth)}
-    for done, row in enumerate(rows):
-        if row == CENTRE:
-            density = centre
-        elif row == ALONE:
-            density = log_pdf(local[HUB], POINTS)
-        elif row == QUOTIENT:
-            density = quotient(start, local)
-        else:
-            density = log_pdf(fused(table[row], start, local, seed), POINTS)
-        samples |= _measured(row, density, centre, truth)
-        progress(0.5 + 0.5 * (done + 1) / len(rows))
-    return samples
-
-
-def _searched_by_all(start: Mixture, progress: Progress) -> Mixture:
-    found = searched(start, ROBOTS)
-    progress(0.25)
-    return found
-
-
-def _searched_by_each(start: Mixture, progress: Progress) -> dict[str, Mixture]:
-    found = {}
-    for done, robot in enumerate(ROBOTS):
-        found[robot] = searched(start, [robot])
-        progress(0.25 + 0.25 * (done + 1) / len(ROBOTS))
-    return found
-
-
-def _measured(row: str, density: Array, centre: Array, truth: Array) -> Samples:
+def _measured(row: str, density: Array, centre: Array, truth: Array) -> Outcomes:
     near = (POINTS**2).sum(-1) < NEAR_M**2
-    found = {
-        f"{row}/kld_from_bayes_nats": divergence(truth, density),
+    from_centre = {} if row == CENTRE else {f"{row}/kld_nats": kl_on_grid(centre, density)}
+    return from_centre | {
+        f"{row}/kld_from_bayes_nats": kl_on_grid(truth, density),
         f"{row}/mass_near_target_1": normalised(density)[:, near].sum(-1),
         row: _thinned(density),
     }
-    return found if row == CENTRE else {f"{row}/kld_nats": divergence(centre, density)} | found
-
-
-def divergence(log_first: Array, log_second: Array) -> Array:
-    """Kullback-Leibler divergence first || second (R,) of log-densities (R, G) on the grid, each normalised there."""
-    first = normalised(log_first)
-    second = normalised(log_second)
-    ratio = np.log(np.maximum(first, 1e-300)) - np.log(np.maximum(second, 1e-300))
-    return np.asarray((first * ratio).sum(-1))
 
 
 def _thinned(log_density: Array) -> Array:
@@ -213,12 +199,12 @@ def _thinned(log_density: Array) -> Array:
     return np.swapaxes(on_grid, 1, 2)[:, ::2, ::2]
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Average the divergences and masses over the priors."""
-    return {name: Estimate.mean(values) for name, values in samples.items() if "/" in name}
+    return {name: Estimate.mean(values) for name, values in outcomes.items() if "/" in name}
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Divergence from the centralised mixture of robot 3's after fusion by any rule for peers, (R,) each.
 
     Raises
@@ -227,18 +213,15 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
     """
     for choice in rules:
         _fuse(choice, seed)
-    return _run_by_run(lambda run, tell: _compared(run, seed, rules, tell), runs, progress)
 
+    def one(run: int, tell: Progress) -> dict[str, float]:
+        search, divergences = Search(run, seed, tell), {}
+        for done, choice in enumerate(rules, 1):
+            divergences[f"gm-{choice.name}/kld_nats"] = float(kl_on_grid(search.centre, search.fused(choice))[0])
+            tell(0.5 + 0.5 * done / len(rules))
+        return divergences
 
-def _compared(run: int, seed: int, rules: Sequence[RuleChoice], progress: Progress) -> Samples:
-    start = prior([run], seed)
-    centre = log_pdf(_searched_by_all(start, progress), POINTS)
-    local, found = _searched_by_each(start, progress), {}
-    for done, choice in enumerate(rules):
-        density = log_pdf(fused(choice, start, local, seed), POINTS)
-        found[f"gm-{choice.name}/kld_nats"] = divergence(centre, density)
-        progress(0.5 + 0.5 * (done + 1) / len(rules))
-    return found
+    return run_by_run(runs, progress, one)
 
 
 # Pictures.
@@ -255,29 +238,25 @@ PANELS = {
 LEVELS = (0.05, 0.2, 0.4, 0.6, 0.8)
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Densities of the first run as contours, as Fig. 9, and the divergences of all rows."""
     side = (np.arange(0, GRID, 2) + 0.5) * 2.0 * HALF_GRID_M / GRID - HALF_GRID_M
-    ways = _ways()
-    panels = []
+    ways, panels = _ways(), []
     for name, title in PANELS.items():
-        if name in samples:
-            z = samples[name][0]
+        if name in outcomes:
+            z = outcomes[name][0]
             levels = tuple(float(share * z.max()) for share in LEVELS)
-            shown = ways if name == "prior" else ways[:1] if name in (ALONE,) else ()
+            shown = ways if name == "prior" else ways[:1] if name == ALONE else ()
             contours = (Contours("density", side, side, z, levels),)
             panels.append(Chart(title, "x, m", "y, m", shown, contours, equal=True))
-    estimates = {n.removesuffix("/kld_nats"): e for n, e in figures(samples).items() if n.endswith("/kld_nats")}
-    if not estimates:
-        return panels
-    at = np.arange(len(estimates), dtype=float)
-    value, error = (np.array([getattr(e, f) for e in estimates.values()]) for f in ("value", "standard_error"))
-    bars = Series("", at, value, "bars", np.nan_to_num(error))
-    ticks = {float(i): row.removeprefix("gm-") for i, row in enumerate(estimates)}
-    return [
-        *panels,
-        Chart("Divergence from the centralised mixture", "", "KLD, nats", (bars,), log_y=True, ticks=ticks),
-    ]
+    divergences = {
+        name.removeprefix("gm-").removesuffix("/kld_nats"): estimate
+        for name, estimate in figures(outcomes).items()
+        if name.endswith("/kld_nats")
+    }
+    if divergences:
+        panels.append(bars("Divergence from the centralised mixture", "KLD, nats", divergences, log_y=True))
+    return panels
 
 
 def _ways() -> tuple[Series, ...]:
@@ -327,10 +306,9 @@ CLAIMS = (
 SCENARIO = Scenario(
     key="ahmed-search",
     title="Five robots search for a target that none of them sees",
-    paper="Ahmed, Decentralized Gaussian Mixture Fusion through Unified Quotient Approximations, 5.3",
+    paper=f"{PAPER}, 5.3",
     shows="exact decentralised fusion of mixtures over a star with channel filters, beside the centralised mixture",
     published=FIGURE_9,
-    published_runs=1,
     default_runs=3,
     publication_runs=20,
     assumptions=(
@@ -347,7 +325,7 @@ SCENARIO = Scenario(
         "pairs of components whose quotient has no integral are left out",
         "the printed divergence belongs to the prior and ways of Fig. 9, a picture: its magnitude alone compares",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=CLAIMS,

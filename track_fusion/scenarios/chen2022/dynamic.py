@@ -8,39 +8,31 @@ matching, and feeding back a fused scatter, then change no number.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from track_fusion.filters import gaussian_student_t_mixture, student_t
-from track_fusion.filters.student_t import cov_from_scatter, scatter_from_cov
+from track_fusion.filters.gaussian_student_t_mixture import GaussianStudentTMixture
+from track_fusion.filters.student_t import StudentT, StudentTParams
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate, armse, rmse
-from track_fusion.models.base import Sensor, Transition
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.noise import Noise
-from track_fusion.random_streams import stream
-from track_fusion.rules import RULES, FusedTracks
+from track_fusion.rules import FusedTracks
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.fast_covariance_intersection import FastCovarianceIntersectionParams
 from track_fusion.rules.geodesic_projection import GeodesicProjectionParams
 from track_fusion.rules.mhdp_explicit import MhdpExplicitParams
 from track_fusion.rules.mhdp_iterative import MhdpIterativeParams
 from track_fusion.rules.quasi_minimal_manhattan import QuasiMinimalManhattanParams
+from track_fusion.scenarios.chen2022 import PAPER
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.scenario import (
-    Claim,
-    Progress,
-    RuleChoice,
-    Samples,
-    Scenario,
-    Tracking,
-    check_needs,
-    chosen,
-    fuse_runs,
-)
+from track_fusion.study.one_target import drawn, fused_row, same_filters
+from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rule_choice import RuleChoice, check_needs
+from track_fusion.study.scenario import Claim, Scenario
+from track_fusion.study.scene import Tracking
 from track_fusion.tracks import StateLayout
 
 #: Degrees of freedom of all densities, and covariance over scatter.
@@ -86,35 +78,10 @@ def for_filter(base: Tracking, name: str) -> Tracking:
     return dataclasses.replace(base, measurement_noise=noise)
 
 
-class RobustFilter(NamedTuple):
-    """A filter of means and covariances (not scatters): predict and update, which also returns what it learned."""
-
-    predict: Callable[[Array, Array, Transition], tuple[Array, Array]]
-    update: Callable[[Array, Array, Array, Sensor], tuple[Array, Array, Any]]
-
-
-def student_t_update(
-    mean: Array, cov: Array, z: Array, sensor: Sensor
-) -> tuple[Array, Array, student_t.StudentInnovation]:
-    """Update of the Student-t filter; the dof is set back to 3, which keeps mean and covariance."""
-    mean, cov, _, innovation = student_t.update(mean, cov, DOF, z, sensor)
-    return mean, cov, innovation
-
-
-def mixture_update(
-    mean: Array, cov: Array, z: Array, sensor: Sensor
-) -> tuple[Array, Array, gaussian_student_t_mixture.Robustness]:
-    """Update of the Gaussian-Student-t-mixture filter, whose nominal matrices and result are scatters of t(3)."""
-    assert isinstance(sensor, LinearSensor)
-    nominal = dataclasses.replace(sensor, noise=sensor.noise / KAPPA)
-    mean, scatter, robustness = gaussian_student_t_mixture.update(mean, scatter_from_cov(cov, DOF), z, nominal)
-    return mean, cov_from_scatter(scatter, DOF), robustness
-
-
-#: The filters of Table 1. Both predict as the Kalman filter does.
+#: The filters of Table 1. Both predict as the Kalman filter does; nominal matrices are scatters of t(3) in both.
 FILTERS = {
-    "stf": RobustFilter(student_t.predict, student_t_update),
-    "gstm": RobustFilter(gaussian_student_t_mixture.predict, mixture_update),
+    "stf": same_filters(StudentT(StudentTParams(dof=DOF))),
+    "gstm": same_filters(GaussianStudentTMixture(dof=DOF)),
 }
 
 #: The rules of Table 1 in its order, and MHDP-E with the criterion as printed.
@@ -158,20 +125,9 @@ ASSUMPTIONS = (
 
 
 def fusions(base: Tracking, name: str, choice: RuleChoice, seed: int, runs: Sequence[int]) -> Iterator[FusedTracks]:
-    """Yield what a rule fuses at each step, fed back to one filter a sensor; mean (R, n), cov (R, n, n)."""
-    met, one = for_filter(base, name), FILTERS[name]
-    seen = [met.measurements(states, seed, run) for states, run in zip(met.truths(seed, runs), runs, strict=True)]
-    stacked = {sensor: np.stack([z[sensor] for z in seen], 1) for sensor in met.sensors}
-    mean = np.tile(met.initial_mean, (len(runs), 1))
-    cov = np.tile(met.initial_cov, (len(runs), 1, 1))
-    rngs = [stream(seed, run, "fusion_centre") for run in runs]
-    for k in range(met.steps):
-        mean, cov = one.predict(mean, cov, met.motion.over(met.dt_s))
-        local = [one.update(mean, cov, stacked[key][k], sensor)[:2] for key, sensor in met.sensors.items()]
-        means, covs = (np.stack(parts, 1) for parts in zip(*local, strict=True))
-        fused = fuse_runs(RULES[choice.key], choice.params, means, covs, rngs, DOF)
-        mean, cov = fused.mean, fused.cov
-        yield fused
+    """What a rule fuses at each step, fed back to one filter a sensor; mean (R, n), cov (R, n, n)."""
+    met = for_filter(base, name)
+    return fused_row(met, FILTERS[name], choice).estimates(drawn(met, runs, seed))
 
 
 #: A row of Table 1: which filter, and the rule.
@@ -185,20 +141,20 @@ def rows(choices: Sequence[RuleChoice]) -> dict[str, Row]:
 
 def squared_errors(
     base: Tracking, table: Mapping[str, Row], runs: Sequence[int], seed: int, progress: Progress
-) -> Samples:
+) -> Outcomes:
     """Squared position errors of every row, (R, T), over the same Monte Carlo runs."""
     truth = base.truths(seed, runs)[:, :, LAYOUT.position]
-    found = {row: np.empty((len(runs), base.steps)) for row in table}
+    squares = {row: np.empty((len(runs), base.steps)) for row in table}
     for done, (row, (name, choice)) in enumerate(table.items()):
         for k, fused in enumerate(fusions(base, name, choice, seed, runs)):
-            found[row][:, k] = ((fused.mean[:, LAYOUT.position] - truth[:, k + 1]) ** 2).sum(-1)
+            squares[row][:, k] = ((fused.mean[:, LAYOUT.position] - truth[:, k + 1]) ** 2).sum(-1)
             progress((done + (k + 1) / base.steps) / len(table))
-    return found
+    return squares
 
 
 def compared(
     base: Tracking, choices: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress
-) -> Samples:
+) -> Outcomes:
     """Root of the time-averaged squared position error of each run, (R,), under any rules, with both filters.
 
     Raises
@@ -206,19 +162,19 @@ def compared(
     ParameterError    a rule needs more than the tracks
     """
     check_needs(choices)
-    found = squared_errors(base, rows(choices), runs, seed, progress)
-    return {f"{row}/position_rmse_m": np.sqrt(squares.mean(1)) for row, squares in found.items()}
+    errors = squared_errors(base, rows(choices), runs, seed, progress)
+    return {f"{row}/position_rmse_m": np.sqrt(squares.mean(1)) for row, squares in errors.items()}
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """ARMSE of each row, and by how much it exceeds that of MHDP-E with the same filter, the runs being paired."""
-    found = {f"{row}/{FIGURE}": armse(squares) for row, squares in samples.items()}
-    for row, squares in samples.items():
+    estimates = {f"{row}/{FIGURE}": armse(squares) for row, squares in outcomes.items()}
+    for row, squares in outcomes.items():
         reference = f"{row.partition('-')[0]}-{MHDP_E}"
-        if row != reference and reference in samples:
-            pair = np.stack([squares, samples[reference]], -1)
-            found[f"{row}/{EXCESS}"] = Estimate.of_averages(pair, _excess)
-    return found
+        if row != reference and reference in outcomes:
+            pair = np.stack([squares, outcomes[reference]], -1)
+            estimates[f"{row}/{EXCESS}"] = Estimate.of_averages(pair, _excess)
+    return estimates
 
 
 def _excess(mean: Array) -> Array:
@@ -227,19 +183,19 @@ def _excess(mean: Array) -> Array:
     return np.asarray(both[:, 0] - both[:, 1])
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Position RMSE over the steps, one chart a filter; DCI, far above, is left out as in Fig. 3."""
-    found = []
+    panels = []
     for name in FILTERS:
-        lines = {row: squares for row, squares in samples.items() if row.startswith(f"{name}-")}
-        drawn = [
+        lines = {row: squares for row, squares in outcomes.items() if row.startswith(f"{name}-")}
+        series = [
             Series(row.partition("-")[2], np.arange(1, squares.shape[1] + 1), rmse(squares))
             for row, squares in lines.items()
             if row != f"{name}-{DCI}" or len(lines) == 1
         ]
-        if drawn:
-            found.append(Chart(f"{name.upper()}: position RMSE", "step", "RMSE / m", tuple(drawn)))
-    return found
+        if series:
+            panels.append(Chart(f"{name.upper()}: position RMSE", "step", "RMSE / m", tuple(series)))
+    return panels
 
 
 def claims(name: str, printed: Mapping[str, float]) -> list[Claim]:
@@ -254,7 +210,7 @@ def claims(name: str, printed: Mapping[str, float]) -> list[Claim]:
 
     others = (DCI, GP, FCI, KLA, QMMHD)
     second, *rest = sorted(others[1:], key=printed.__getitem__)
-    found = [
+    statements = [
         Claim(f"{label}: MHDP-E has clearly lower errors than DCI, GP, FCI, KLA and QMMHD", "5.2, Fig. 3, Table 1",
               tuple(f"{name}-{rule}/{EXCESS}" for rule in others), clear),
         Claim.least(f"{label}: {SHORT[second]} comes next, before {', '.join(SHORT[rule] for rule in rest)}",
@@ -263,8 +219,9 @@ def claims(name: str, printed: Mapping[str, float]) -> list[Claim]:
     ]  # fmt: skip
     if name == "gstm":
         text = f"{label}: MHDP-I is slightly, but clearly better than MHDP-E"
-        found.append(Claim(text, "5.2", (f"{name}-{MHDP_I}/{EXCESS}",), lambda e: e.value < -CLEAR * e.standard_error))
-    return found
+        names = (f"{name}-{MHDP_I}/{EXCESS}",)
+        statements.append(Claim(text, "5.2", names, lambda e: e.value < -CLEAR * e.standard_error))
+    return statements
 
 
 def scenario(key: str, title: str, base: Tracking, table: Mapping[str, Sequence[float]], runs: int) -> Scenario:
@@ -280,7 +237,7 @@ def scenario(key: str, title: str, base: Tracking, table: Mapping[str, Sequence[
     return Scenario(
         key=key,
         title=title,
-        paper="Chen and Zhou, Multisensor Estimation Fusion on Statistical Manifold, 5.2",
+        paper=f"{PAPER}, 5.2",
         shows="rules that see heavy-tailed densities beside rules that see moments, when outliers disturb motion and "
         "measurements and the fused posterior is fed back to robust filters",
         published={
@@ -290,7 +247,7 @@ def scenario(key: str, title: str, base: Tracking, table: Mapping[str, Sequence[
         default_runs=runs,
         publication_runs=500,
         assumptions=ASSUMPTIONS,
-        sample=lambda runs, seed, progress, only: squared_errors(
+        simulate=lambda runs, seed, progress, only: squared_errors(
             base, chosen(rows(RULE_CHOICES), only), runs, seed, progress
         ),
         figures=figures,

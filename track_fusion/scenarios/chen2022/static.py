@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -12,16 +13,19 @@ from track_fusion.densities.elliptical.elliptical import Family, generalized_gau
 from track_fusion.densities.elliptical.rao import informative_barycenter, rao_distance_scalar, scalar_geodesic
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.rules import RULES, SourceTracks
+from track_fusion.rules import SourceTracks
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
-from track_fusion.rules.elliptical_tracks import EllipticalParams
 from track_fusion.rules.fast_covariance_intersection import FastCovarianceIntersectionParams
 from track_fusion.rules.geodesic_projection import GeodesicProjectionParams
 from track_fusion.rules.mhdp_explicit import MhdpExplicitParams
 from track_fusion.rules.mhdp_iterative import MhdpIterativeParams
 from track_fusion.rules.quasi_minimal_manhattan import QuasiMinimalManhattanParams
+from track_fusion.rules.shared.elliptical import EllipticalParams
+from track_fusion.scenarios.chen2022 import PAPER
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario, chosen, compare_each
+from track_fusion.study.rows import Outcomes, Progress, exact_rows
+from track_fusion.study.rule_choice import RuleChoice, compare_each
+from track_fusion.study.scenario import Claim, Scenario
 
 #: The local estimates of 5.1: means, and scatters (scalar: the squares of scale parameters).
 MEANS, SCATTERS = np.array([2.0, 4.0]), np.array([5.0, 7.0])
@@ -60,7 +64,7 @@ class Setting:
         params = choice.params
         if isinstance(params, EllipticalParams) and params.family != "gaussian" and self.dof is None:
             params = dataclasses.replace(params, family="generalized_gaussian", beta=self.beta)
-        fused = RULES[choice.key].fuse(self.tracks, params)
+        fused = choice.rule.fuse(self.tracks, params)
         return np.array([fused.mean[0], fused.cov[0, 0] / self.family.kappa])
 
     def from_barycenter(self, fused: Array) -> float:
@@ -109,26 +113,28 @@ def row_name(choice: RuleChoice, setting: str) -> str:
 ROWS = {row_name(choice, name): (choice, setting) for name, setting in SETTINGS.items() for choice in RULE_CHOICES}
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
-    """Fuse by the rows whose names start with `only`: mean and scatter, (R, 2); nothing is random."""
-    rows, found = chosen(ROWS, only), {}
-    for done, (row, (choice, setting)) in enumerate(rows.items()):
-        found[row] = np.tile(setting.fuse(choice), (len(runs), 1))
-        progress((done + 1) / len(rows))
-    return found
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
+    """Fuse by the rows whose names start with `only`: {row/fused: mean and scatter, (R, 2)}; nothing is random."""
+    rows = {name: partial(_fused, *row) for name, row in ROWS.items()}
+    return exact_rows(rows, runs, seed, progress, only)
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def _fused(choice: RuleChoice, setting: Setting) -> dict[str, Array]:
+    return {"fused": setting.fuse(choice)}
+
+
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Rao distances from the barycenter and from the geodesic, names like given-mhdp_explicit@t3/rao_distance_1."""
-    found = {}
-    for row, fused in samples.items():
+    measured = {}
+    for name, fused in outcomes.items():
+        row = name.removesuffix("/fused")
         setting = ROWS[row][1]
-        found[f"{row}/rao_distance_1"] = Estimate.exact(setting.from_barycenter(fused[0]))
-        found[f"{row}/geodesic_distance_1"] = Estimate.exact(setting.from_geodesic(fused[0]))
-    return found
+        measured[f"{row}/rao_distance_1"] = Estimate.exact(setting.from_barycenter(fused[0]))
+        measured[f"{row}/geodesic_distance_1"] = Estimate.exact(setting.from_geodesic(fused[0]))
+    return measured
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Rao distance from the barycenter under any rules, a quantity a family; nothing is random.
 
     Raises
@@ -136,16 +142,16 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
     ParameterError    a rule needs more than the tracks
     """
 
-    def measure(choice: RuleChoice) -> Samples:
+    def measure(choice: RuleChoice) -> Outcomes:
         distances = {name: setting.from_barycenter(setting.fuse(choice)) for name, setting in SETTINGS.items()}
         return {f"rao_distance_{name}_1": np.full(len(runs), value) for name, value in distances.items()}
 
     return compare_each("given", rules, progress, measure)
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Distances from the barycenter by family, and the plane of means and scatters for two of them."""
-    measured, places, bars = figures(samples), np.arange(len(SETTINGS), dtype=float), []
+    measured, places, bars = figures(outcomes), np.arange(len(SETTINGS), dtype=float), []
     for choice in RULE_CHOICES:
         if choice.key == MHDP_I.key:
             continue  # in one axis it is MHDP-E
@@ -155,11 +161,11 @@ def charts(samples: Samples) -> list[Chart]:
             bars.append(Series(choice.name, places, np.array(values), "bars"))
     ticks = dict(zip(places.tolist(), (setting.title for setting in SETTINGS.values()), strict=True))
     title = "Rao distance of the fused density from the informative barycenter"
-    planes = [_plane(name, samples) for name in DRAWN if any(row_name(c, name) in samples for c in RULE_CHOICES)]
+    planes = [_plane(s, outcomes) for s in DRAWN if any(f"{row_name(c, s)}/fused" in outcomes for c in RULE_CHOICES)]
     return [Chart(title, "family of both estimates", "Rao distance", tuple(bars), ticks=ticks), *planes]
 
 
-def _plane(name: str, samples: Samples) -> Chart:
+def _plane(name: str, outcomes: Outcomes) -> Chart:
     """Draw where the rules put the fused density, between the geodesic and the chord."""
     setting = SETTINGS[name]
     (means, scatters), centre = setting.geodesic(np.linspace(0.0, 1.0, 101)), np.array(setting.barycenter)
@@ -169,7 +175,7 @@ def _plane(name: str, samples: Samples) -> Chart:
         Series("informative barycenter", centre[:1], centre[1:], "points"),
     ]
     for choice in (*OTHERS, MHDP_E):
-        fused = samples.get(row_name(choice, name))
+        fused = outcomes.get(f"{row_name(choice, name)}/fused")
         if fused is not None:
             lines.append(Series(choice.name, fused[:1, 0], fused[:1, 1], "points"))
     return Chart(f"{setting.title}: fused densities", "mean", "scatter", tuple(lines))
@@ -210,12 +216,8 @@ CLAIMS = (
 SCENARIO = Scenario(
     key="chen2022-static",
     title="Two estimates of a number from one heavy-tailed family",
-    paper="Chen and Zhou, Multisensor Estimation Fusion on Statistical Manifold, 5.1",
+    paper=f"{PAPER}, 5.1",
     shows="how near each rule comes to the midpoint of the geodesic between two densities, at six weights of the tails",
-    published={},  # Fig. 2 prints no number
-    published_runs=1,
-    default_runs=1,
-    publication_runs=1,
     assumptions=(
         "5 and 7 are scatters; rules for Gaussians see kappa times them, and what is fused is divided by kappa",
         "GP takes the tracks for Gaussian; FCI is the exact half-way point; DCI minimises the determinant, KLA weighs "
@@ -224,7 +226,7 @@ SCENARIO = Scenario(
         "MHDP minimises the sum of squared distances; @unsquared: that of the distances, as printed, which makes one "
         "sensor's estimate the fused mean",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=CLAIMS,

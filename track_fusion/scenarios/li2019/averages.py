@@ -1,4 +1,4 @@
-"""Averages of random variables: moments, mean square errors, best weights and bounds (v-fusion).
+"""Averages of random variables: moments, mean square errors, best weights of two and bounds (v-fusion).
 
 An average here is of estimates, numbers such as a count of targets, not of densities; those are in rules/. Li et al.,
 Second Order Statistics Analysis and Comparison between Arithmetic and Geometric Average Fusion, 2019, section 3.
@@ -7,11 +7,8 @@ Second Order Statistics Analysis and Comparison between Arithmetic and Geometric
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from track_fusion.linalg import Array, matvec, outer
-from track_fusion.solvers.optimise import Solution, minimise_on_simplex
 
 #: Stands for the logarithm of zero: times a weight of zero it is zero, times any other it has the exponential zero.
 LOG_OF_NOTHING = -1e300
@@ -94,37 +91,6 @@ def average_moments(values: Array, probability: Array, weights: Array, geometric
     return mean, np.asarray((average - mean[..., None]) ** 2 @ probability)
 
 
-def positive_normal_pair(mean: Array, cov: Array, nodes: int = 200, reach: float = 8.0) -> tuple[Array, Array]:
-    """Quadrature nodes of two jointly normal variables cut to positive values, as in Figs. 1, 3 and 4.
-
-    Parameters
-    ----------
-    mean, cov : (2,), (2, 2)    moments before the cut
-    nodes : int                 Gauss-Legendre nodes an axis
-    reach : float               standard deviations that the nodes go beyond the mean
-
-    Returns
-    -------
-    values (nodes^2, 2), probability (nodes^2,)    for `average_moments`
-
-    Raises
-    ------
-    ValueError    less than half of either variable is positive: cut, it is no longer nearly normal
-    """
-    sigma = np.sqrt(np.diagonal(cov))
-    if (ndtr(mean / sigma) <= 0.5).any():
-        raise ValueError(f"The 'mean' of variables cut to positive values must be positive. Got {mean.tolist()}.")
-    points, share = np.polynomial.legendre.leggauss(nodes)
-    low = np.maximum(mean - reach * sigma, 0.0)
-    half = 0.5 * (mean + reach * sigma - low)
-    first, second = (low[i] + half[i] * (points + 1.0) for i in (0, 1))
-    values = np.stack(np.meshgrid(first, second, indexing="ij"), -1).reshape(-1, 2)
-    residual = values - mean
-    exponent = (residual * np.linalg.solve(cov, residual.T).T).sum(-1)
-    probability = np.outer(share, share).ravel() * np.exp(-0.5 * (exponent - exponent.min()))
-    return values, probability / probability.sum()
-
-
 # Mean square errors.
 
 
@@ -178,38 +144,6 @@ def variance_bounds(first: Array, second: Array, correlation: Array) -> tuple[Ar
     return first * relative_variance(weights[..., 1], ratio, correlation), np.maximum(first, second)
 
 
-def beats_both(first: Array, second: Array, correlation: Array) -> NDArray[np.bool_]:
-    """Tell whether some weights give less variance than either variable: (22), of mean square errors (26)."""
-    return np.asarray(correlation < np.sqrt(np.minimum(first, second) / np.maximum(first, second)))
-
-
-def unweighted_limit(ratio: Array) -> Array:
-    """Correlation g (28) below which the plain average beats the better variable; ratio is worse over better.
-
-    Below -1, for ratios above 9, it never does.
-    """
-    return np.asarray((3.0 - ratio) / (2.0 * np.sqrt(ratio)))
-
-
-# Any number of variables.
-
-
-def best_weights(cov: Array) -> Solution:
-    """Weights that minimise the variance of an arithmetic average of K variables, over the simplex.
-
-    Parameters
-    ----------
-    cov : (B, K, K)    covariances between the variables, or `error_moments` for the mean square error
-
-    Returns
-    -------
-    Solution    weights (B, K)
-    """
-    scale = np.diagonal(cov, axis1=-2, axis2=-1).max(-1, initial=0.0)
-    unit = cov / np.where(scale > 0, scale, 1.0)[:, None, None]
-    return minimise_on_simplex(lambda w, rows: (matvec(unit[rows], w), unit[rows]), len(cov), cov.shape[-1])
-
-
 # Averages of densities on a grid (f-fusion), section 2.3.
 
 
@@ -237,10 +171,10 @@ def density_average(densities: Array, width: Array, weights: Array, geometric: b
     return np.asarray(average / mass)
 
 
-def density_moments(nodes: Array, density: Array, width: Array, truth: float | None = None) -> tuple[Array, Array]:
-    """Mean and variance of a density on a grid, or mean and mean square error (3) about `truth`."""
+def density_moments(nodes: Array, density: Array, width: Array) -> tuple[Array, Array]:
+    """Mean and variance of a density on a grid."""
     mean = (nodes * density) @ width
-    return np.asarray(mean), np.asarray(((nodes - (mean if truth is None else truth)) ** 2 * density) @ width)
+    return np.asarray(mean), np.asarray(((nodes - mean) ** 2 * density) @ width)
 
 
 def _check_weights(weights: Array) -> None:

@@ -2,45 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-
 import numpy as np
 
 from track_fusion.densities.log_domain import normalised
-from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments
+from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.linalg import Array
-from track_fusion.metrics.accuracy import Estimate
-from track_fusion.rules import RULES, FusedTracks, SourceTracks
-from track_fusion.study.scenario import Progress, RuleChoice, Samples, check_needs, chosen
-
-PAPER = (
-    "Li et al., Second Order Statistics Analysis and Comparison between Arithmetic and Geometric Average Fusion, 2019, "
-)
-
-
-# Rows in which nothing is random.
-
-
-def exact_samples(
-    rows: Mapping[str, Callable[[], Mapping[str, float]]], runs: Sequence[int], progress: Progress, only: str
-) -> Samples:
-    """Work out the rows whose names start with `only`; every run has the same numbers, (R,) each.
-
-    Parameters
-    ----------
-    rows : mapping    row name -> function that gives {quantity: value}
-    """
-    found: Samples = {}
-    wanted = chosen(rows, only)
-    for done, (row, measure) in enumerate(wanted.items(), 1):
-        found |= {f"{row}/{quantity}": np.full(len(runs), float(value)) for quantity, value in measure().items()}
-        progress(done / len(wanted))
-    return found
-
-
-def exact_figures(samples: Samples) -> dict[str, Estimate]:
-    """Figures of samples in which nothing is random."""
-    return {name: Estimate.exact(values[0]) for name, values in samples.items()}
+from track_fusion.rules import FusedTracks, SourceTracks
+from track_fusion.study.rule_choice import RuleChoice, check_needs
 
 
 def fuse(choice: RuleChoice, tracks: SourceTracks) -> FusedTracks:
@@ -51,7 +19,7 @@ def fuse(choice: RuleChoice, tracks: SourceTracks) -> FusedTracks:
     ParameterError    the rule needs something beside the tracks
     """
     check_needs([choice])
-    return RULES[choice.key].fuse(tracks, choice.params)
+    return choice.fuse(tracks)
 
 
 # Mixtures of one axis.
@@ -60,11 +28,6 @@ def fuse(choice: RuleChoice, tracks: SourceTracks) -> FusedTracks:
 def scalar_mixture(weight: Array, mean: Array, variance: Array) -> Mixture:
     """Make mixtures of one axis, (..., C) each."""
     return Mixture(np.asarray(weight), np.asarray(mean)[..., None], np.asarray(variance)[..., None, None])
-
-
-def as_tracks(parts: Mixture) -> SourceTracks:
-    """Make tracks of mixtures (..., K, C)."""
-    return SourceTracks(*moments(parts), mixture=parts)
 
 
 def intensity(mixture: Mixture, x: Array) -> Array:
@@ -82,12 +45,8 @@ def fused_intensity(choice: RuleChoice, parts: Mixture) -> Mixture:
 
     A rule that gives a Gaussian is a mixture of one component.
     """
-    fused = fuse(choice, as_tracks(parts))
-    where = fused.mixture
-    if where is None:
-        where = Mixture(np.ones((*fused.mean.shape[:-1], 1)), fused.mean[..., None, :], fused.cov[..., None, :, :])
-    where = where.normalised
-    return Mixture(expected_number(parts)[..., None] * where.weight, where.mean, where.cov)
+    density = fuse(choice, SourceTracks.of(parts)).density.normalised
+    return Mixture(expected_number(parts)[..., None] * density.weight, density.mean, density.cov)
 
 
 def exact_geometric(parts: Mixture, x: Array) -> Array:

@@ -8,15 +8,18 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from track_fusion.densities.gaussian import merge, weighted_product
-from track_fusion.linalg import Array
+from track_fusion.densities.gaussian import weighted_product
+from track_fusion.linalg import Array, merged_moments
 from track_fusion.rules import SourceTracks
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.rules.geometric_average import GeometricAverageParams
+from track_fusion.scenarios.li2019 import PAPER
 from track_fusion.scenarios.li2019.averages import density_average, density_moments
-from track_fusion.scenarios.li2019.common import PAPER, exact_figures, exact_samples, fuse
+from track_fusion.scenarios.li2019.common import fuse
 from track_fusion.study.chart import Chart, Contours, Series
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario
+from track_fusion.study.rows import Outcomes, Progress, exact_figures, exact_rows
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Claim, Scenario
 
 #: Weights of the first density, the ends apart, and values of the parameter.
 WEIGHT = np.linspace(0.0, 1.0, 101)[1:-1]
@@ -45,7 +48,7 @@ class Pair:
         weights, tracks = np.stack([weight, 1.0 - weight], -1), self.tracks
         mean = np.broadcast_to(tracks.mean, (len(weight), 2, 1))
         cov = np.broadcast_to(tracks.cov, (len(weight), 2, 1, 1))
-        fused_mean, fused_cov = (merge if average == AA else weighted_product)(mean, cov, weights)
+        fused_mean, fused_cov = (merged_moments if average == AA else weighted_product)(mean, cov, weights)
         return fused_mean[:, 0], fused_cov[:, 0, 0]
 
     def errors(self, average: str, weight: Array, theta: Array) -> Array:
@@ -161,24 +164,16 @@ def _rows() -> dict[str, Callable[[], Mapping[str, float]]]:
 ROWS = _rows()
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
-    """Work out the rows whose names start with `only`: their figures, (R,), the same in every run."""
-    return exact_samples(ROWS, runs, progress, only)
-
-
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Root of the mean square error (3) of what any rules make of Figs. 5 and 6, averaged over the parameter, (R,)."""
 
     def errors(choice: RuleChoice) -> dict[str, float]:
-        found = {}
-        for name, pair in PAIRS.items():
-            fused = fuse(choice, pair.tracks)
-            squares = fused.cov[0, 0] + (fused.mean[0] - THETA) ** 2
-            found[f"{name}_rms_error_1"] = float(np.sqrt(squares.mean()))
-        return found
+        fused = {name: fuse(choice, pair.tracks) for name, pair in PAIRS.items()}
+        squares = {name: f.cov[0, 0] + (f.mean[0] - THETA) ** 2 for name, f in fused.items()}
+        return {f"{name}_rms_error_1": float(np.sqrt(square.mean())) for name, square in squares.items()}
 
     rows = {f"given-{choice.name}": functools.partial(errors, choice) for choice in rules}
-    return exact_samples(rows, runs, progress, "")
+    return exact_rows(rows, runs, seed, progress)
 
 
 # Charts.
@@ -188,26 +183,26 @@ LEVELS = (150.0, 200.0, 300.0, 400.0, 600.0)
 EXCESS_LEVELS = (-50.0, 0.0, 50.0, 100.0)
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Figs. 5 and 6: variances, mean square errors and their difference; Appendix B: the densities."""
-    found = []
+    panels = []
     for name, pair in PAIRS.items():
         title = f"Fig. {name[-1]}"
-        averages = [a for a in (AA, GA) if f"{a}@{name}/mean_1" in samples]
+        averages = [a for a in (AA, GA) if f"{a}@{name}/mean_1" in outcomes]
         if averages:
-            found.append(_variance_chart(title, pair, averages))
+            panels.append(_variance_chart(title, pair, averages))
             lines = tuple(_contours(a, pair.errors(a, CHART_WEIGHT, CHART_THETA), LEVELS) for a in averages)
             lines_at = ", ".join(f"{level:g}" for level in LEVELS)
-            found.append(_plane(f"{title}: mean square error (lines at {lines_at})", lines))
+            panels.append(_plane(f"{title}: mean square error (lines at {lines_at})", lines))
         if len(averages) == 2:
             inner = CHART_WEIGHT[1:-1]  # at both ends the averages are equal
             excess = pair.excess(inner, CHART_THETA)
             levels = [level for level in EXCESS_LEVELS if excess.min() < level < excess.max()]
             levelled = tuple(Contours(f"{level:g}", inner, CHART_THETA, excess, (level,)) for level in levels)
-            found.append(_plane(f"{title}: mean square error, arithmetic minus geometric", levelled))
-    if f"{GA}@appendix/mean_1" in samples:
-        found.append(_appendix_chart())
-    return found
+            panels.append(_plane(f"{title}: mean square error, arithmetic minus geometric", levelled))
+    if f"{GA}@appendix/mean_1" in outcomes:
+        panels.append(_appendix_chart())
+    return panels
 
 
 def _variance_chart(title: str, pair: Pair, averages: Sequence[str]) -> Chart:
@@ -329,12 +324,9 @@ CLAIMS = (
 SCENARIO = Scenario(
     key="li2019-densities",
     title="Averages of two densities",
-    paper=PAPER + "4, Figs. 5, 6, Appendix B",
+    paper=f"{PAPER}, 4, Figs. 5, 6, Appendix B",
     shows="variance and mean square error of the arithmetic and the geometric average of two Gaussian densities",
     published={f"{GA}@appendix/mean_1": 0.8485, f"{AA}@appendix/mean_1": 0.9428},  # 3 sqrt(2)/5, 2 sqrt(2)/3
-    published_runs=1,
-    default_runs=1,
-    publication_runs=1,
     assumptions=(
         "closed forms (32)-(35), (40), (41) in place of the paper's Monte Carlo simulation",
         "mean square error: of a draw from the fused density, (3), the parameter being fixed",
@@ -343,7 +335,7 @@ SCENARIO = Scenario(
         "assumed: variances 100 and 100, or means 50 and 50, for Remark 7; means 50 and 80 for Remark 5",
         "printed means of Appendix B, 3 sqrt(2)/5 and 2 sqrt(2)/3, as decimals",
     ),
-    sample=sample,
+    simulate=functools.partial(exact_rows, ROWS),
     figures=exact_figures,
     charts=charts,
     claims=CLAIMS,

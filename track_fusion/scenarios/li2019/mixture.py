@@ -7,22 +7,22 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from track_fusion.densities.mixture.divergence import kl_on_grid
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf
+from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.linalg import Array
 from track_fusion.rules.mixture_average import MixtureAverageParams
 from track_fusion.rules.mixture_hybrid import MixtureHybridParams
+from track_fusion.scenarios.li2019 import PAPER
 from track_fusion.scenarios.li2019.common import (
-    PAPER,
-    exact_figures,
     exact_geometric,
-    exact_samples,
     fused_intensity,
     intensity,
     scalar_mixture,
 )
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario
+from track_fusion.study.rows import Outcomes, Progress, exact_figures, exact_rows
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Claim, Scenario
 
 #: GM 1 and GM 2, the second padded by a component of weight 0.
 PARTS = scalar_mixture(
@@ -71,12 +71,12 @@ def shape_figures(values: Array) -> dict[str, float]:
 def rule_row(choice: RuleChoice) -> dict[str, float]:
     """Components by ascending mean, and the shape of the whole."""
     mixture = fused_mixture(choice)
-    found = {}
+    measured = {}
     for at, part in enumerate(np.argsort(mixture.mean[:, 0], kind="stable"), 1):
-        found[f"component{at}_weight_1"] = mixture.weight[part]
-        found[f"component{at}_mean_1"] = mixture.mean[part, 0]
-        found[f"component{at}_variance_1"] = mixture.cov[part, 0, 0]
-    return found | shape_figures(intensity(mixture, X))
+        measured[f"component{at}_weight_1"] = mixture.weight[part]
+        measured[f"component{at}_mean_1"] = mixture.mean[part, 0]
+        measured[f"component{at}_variance_1"] = mixture.cov[part, 0, 0]
+    return measured | shape_figures(intensity(mixture, X))
 
 
 def _rows() -> dict[str, Callable[[], Mapping[str, float]]]:
@@ -95,29 +95,23 @@ def _rows() -> dict[str, Callable[[], Mapping[str, float]]]:
 ROWS = _rows()
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
-    """Fuse by the rows whose names start with `only`: their figures, (R,), the same in every run."""
-    return exact_samples(ROWS, runs, progress, only)
-
-
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Divergence of the two sources from what any rules give, and of that from the sources, both averaged, (R,).
 
     Intensities are normalised. The arithmetic average has the least divergence of the sources from it, the exact
     geometric average the least from the sources. A rule that samples draws the same in every run.
     """
-    points = X[:, None]
-    sources = [functools.partial(log_pdf, PARTS.at(k)) for k in range(2)]
+    sources = log_pdf(PARTS, X[:, None])
 
     def divergences(choice: RuleChoice) -> dict[str, float]:
-        fused = functools.partial(log_pdf, fused_mixture(choice))
+        fused = log_pdf(fused_mixture(choice), X[:, None])
         return {
-            "kld_of_sources_nats": float(np.mean([kl_on_grid(source, fused, points) for source in sources])),
-            "kld_from_sources_nats": float(np.mean([kl_on_grid(fused, source, points) for source in sources])),
+            "kld_of_sources_nats": float(kl_on_grid(sources, fused).mean()),
+            "kld_from_sources_nats": float(kl_on_grid(fused, sources).mean()),
         }
 
     rows = {f"given-{choice.name}": functools.partial(divergences, choice) for choice in rules}
-    return exact_samples(rows, runs, progress, "")
+    return exact_rows(rows, runs, seed, progress)
 
 
 # Charts and claims.
@@ -127,18 +121,18 @@ CHART_X = np.linspace(-30.0, 140.0, 341)
 VISIBLE = 0.002
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Fig. 7: the intensities, and the components of the geometric average."""
     lines = [Series(f"GM {k + 1}", CHART_X, intensity(PARTS.at(k), CHART_X), "dotted") for k in range(2)]
     for row, choice, label in ((AA, AVERAGE, "arithmetic"), (GA, HYBRID, "geometric")):
-        if f"{row}/peaks_1" in samples:
+        if f"{row}/peaks_1" in outcomes:
             lines.append(Series(label, CHART_X, intensity(fused_mixture(choice), CHART_X)))
-    if f"{EXACT}/peaks_1" in samples:
+    if f"{EXACT}/peaks_1" in outcomes:
         lines.append(Series("geometric, exact", CHART_X, np.interp(CHART_X, X, _exact()), "dashed"))
-    found = [Chart("Fig. 7: averages at equal weights", "x", "targets per unit of x", tuple(lines))]
-    if f"{GA}/peaks_1" in samples:
-        found.append(_component_chart())
-    return found
+    panels = [Chart("Fig. 7: averages at equal weights", "x", "targets per unit of x", tuple(lines))]
+    if f"{GA}/peaks_1" in outcomes:
+        panels.append(_component_chart())
+    return panels
 
 
 def _component_chart() -> Chart:
@@ -203,12 +197,8 @@ CLAIMS = (
 SCENARIO = Scenario(
     key="li2019-mixture",
     title="Averages of two intensities, one component isolated",
-    paper=PAPER + "5.2, Fig. 7",
+    paper=f"{PAPER}, 5.2, Fig. 7",
     shows="what a component that one source alone has becomes in the arithmetic and in the geometric average",
-    published={},
-    published_runs=1,
-    default_runs=1,
-    publication_runs=1,
     assumptions=(
         "the geometric average takes its number of targets from the arithmetic average, as in section 5.2",
         "@exact: the geometric average without the approximation (49), point by point",
@@ -216,7 +206,7 @@ SCENARIO = Scenario(
         "isolated component, 28.3, beyond the targets and that component",
         "components are numbered by ascending mean",
     ),
-    sample=sample,
+    simulate=functools.partial(exact_rows, ROWS),
     figures=exact_figures,
     charts=charts,
     claims=CLAIMS,

@@ -16,15 +16,17 @@ from track_fusion.metrics.accuracy import Estimate
 from track_fusion.random_streams import stream
 from track_fusion.rules.mixture_average import MixtureAverageParams
 from track_fusion.rules.mixture_hybrid import MixtureHybridParams
+from track_fusion.scenarios.li2019 import PAPER
 from track_fusion.scenarios.li2019.common import (
-    PAPER,
     exact_geometric,
     fused_intensity,
     intensity,
     scalar_mixture,
 )
-from track_fusion.study.chart import Chart, Series, Style
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario, chosen, compare_each
+from track_fusion.study.chart import Chart, Series, estimates
+from track_fusion.study.rows import Outcomes, Progress, chosen, row_by_row
+from track_fusion.study.rule_choice import RuleChoice, compare_each
+from track_fusion.study.scenario import Claim, Scenario
 
 TARGETS = np.array([20.0, 40.0, 70.0, 110.0, 200.0])
 SENSORS = 6
@@ -84,12 +86,17 @@ def trials(runs: Sequence[int], seed: int, certain: bool = False) -> tuple[Mixtu
 # What becomes of them.
 
 
-class Outcome(NamedTuple):
-    """What is left of a trial: expected number of targets NEAR each (R, 5), FAR from all (R,), intensity at BETWEEN."""
+class Kept(NamedTuple):
+    """What is left of trials: expected number of targets NEAR each (R, 5), FAR from all (R,), intensity at BETWEEN."""
 
     near: Array
     far: Array
     between: Array
+
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """Which targets are lost, (R, 5)."""
+        return np.asarray(self.near < least_mass())
 
     @property
     def mixed(self) -> NDArray[np.bool_]:
@@ -97,8 +104,8 @@ class Outcome(NamedTuple):
         return np.asarray(self.between[:, 1] > np.maximum(self.between[:, 0], self.between[:, 2]))
 
 
-def of_mixtures(mixture: Mixture) -> Outcome:
-    """Outcome of mixtures (R, C)."""
+def of_mixtures(mixture: Mixture) -> Kept:
+    """What is kept in mixtures (R, C)."""
     deviation = np.sqrt(mixture.cov[..., 0, 0])[..., None]
 
     def below(edge: Array) -> Array:
@@ -107,15 +114,15 @@ def of_mixtures(mixture: Mixture) -> Outcome:
 
     near = below(TARGETS + NEAR) - below(TARGETS - NEAR)
     gaps = below(np.append(TARGETS - FAR, np.inf)) - below(np.append(-np.inf, TARGETS + FAR))
-    return Outcome(near, gaps.clip(0).sum(-1), intensity(mixture, BETWEEN))
+    return Kept(near, gaps.clip(0).sum(-1), intensity(mixture, BETWEEN))
 
 
-def on_grid(values: Array) -> Outcome:
-    """Outcome of intensities at X, (R, S)."""
+def on_grid(values: Array) -> Kept:
+    """What is kept in intensities at X, (R, S)."""
     distance, step = np.abs(X[:, None] - TARGETS), X[1] - X[0]
     far = (distance.min(-1) > FAR).astype(float)
     beside = np.abs(X[:, None] - BETWEEN) < step  # a point to either side
-    return Outcome(values @ (distance < NEAR) * step, values @ far * step, values @ beside / 2.0)
+    return Kept(values @ (distance < NEAR) * step, values @ far * step, values @ beside / 2.0)
 
 
 @functools.cache
@@ -125,7 +132,7 @@ def least_mass() -> float:
     return float(0.5 * np.median(of_mixtures(fused_intensity(AVERAGE, parts)).near))
 
 
-Fusion = Callable[[Mixture], Outcome]
+Fusion = Callable[[Mixture], Kept]
 
 
 def by_rule(choice: RuleChoice, sensors: int = SENSORS) -> Fusion:
@@ -144,7 +151,7 @@ def _rows() -> dict[str, Fusion]:
 ROWS = _rows()
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Fuse trials by the rows whose names start with `only`.
 
     Returns
@@ -153,36 +160,33 @@ def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -
     with all sensors, row/missed: how many missed each, (R, 5); row/mixed: whether two became one, (R,)}
     """
     parts, seen = trials(runs, seed)
-    found: Samples = {}
-    wanted = chosen(ROWS, only)
-    for done, (row, fusion) in enumerate(wanted.items(), 1):
-        outcome = fusion(parts)
-        found[f"{row}/lost"] = (outcome.near < least_mass()).astype(float)
-        found[f"{row}/far"] = outcome.far
-        if "sensors" not in row:
-            found[f"{row}/missed"] = (~seen).sum(1).astype(float)
-            found[f"{row}/mixed"] = outcome.mixed.astype(float)
-        progress(done / len(wanted))
-    return found
+    missed = (~seen).sum(1).astype(float)
+
+    def measure(row: str) -> Outcomes:
+        kept = ROWS[row](parts)
+        columns = {"lost": kept.lost.astype(float), "far": kept.far}
+        return columns if "sensors" in row else columns | {"missed": missed, "mixed": kept.mixed.astype(float)}
+
+    return row_by_row({row: row for row in chosen(ROWS, only)}, progress, measure)
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Lost targets a trial, mass of false alarms; how often a target is lost that so many sensors missed."""
-    found: dict[str, Estimate] = {}
+    measured: dict[str, Estimate] = {}
     for row in ROWS:
-        if f"{row}/lost" not in samples:
+        if f"{row}/lost" not in outcomes:
             continue
-        lost = samples[f"{row}/lost"]
-        found[f"{row}/lost_targets_1"] = Estimate.mean(lost.sum(-1))
-        found[f"{row}/far_mass_1"] = Estimate.mean(samples[f"{row}/far"])
-        if f"{row}/missed" not in samples:
+        lost = outcomes[f"{row}/lost"]
+        measured[f"{row}/lost_targets_1"] = Estimate.mean(lost.sum(-1))
+        measured[f"{row}/far_mass_1"] = Estimate.mean(outcomes[f"{row}/far"])
+        if f"{row}/missed" not in outcomes:
             continue
-        found[f"{row}/mixed_share_1"] = Estimate.mean(samples[f"{row}/mixed"])
+        measured[f"{row}/mixed_share_1"] = Estimate.mean(outcomes[f"{row}/mixed"])
         for k, target in enumerate(TARGETS):
-            found[f"{row}/lost_at_{target:.0f}_share_1"] = Estimate.mean(lost[:, k])
+            measured[f"{row}/lost_at_{target:.0f}_share_1"] = Estimate.mean(lost[:, k])
         for count in range(3):
-            found |= _lost_share(row, lost, samples[f"{row}/missed"] == count, count)
-    return found
+            measured |= _lost_share(row, lost, outcomes[f"{row}/missed"] == count, count)
+    return measured
 
 
 def _lost_share(row: str, lost: Array, cases: NDArray[np.bool_], count: int) -> dict[str, Estimate]:
@@ -193,16 +197,13 @@ def _lost_share(row: str, lost: Array, cases: NDArray[np.bool_], count: int) -> 
     return {f"{row}/lost_missed_by_{count}_share_1": Estimate.of_averages(both, lambda m: m[:, 0] / m[:, 1])}
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Lost targets and mass far from all targets of any rules, each scaled to the mean number of targets, (R,)."""
     parts, _ = trials(runs, seed)
 
-    def measure(choice: RuleChoice) -> Samples:
-        outcome = by_rule(choice)(parts)
-        return {
-            "lost_targets_1": (outcome.near < least_mass()).sum(-1).astype(float),
-            "far_mass_1": outcome.far,
-        }
+    def measure(choice: RuleChoice) -> Outcomes:
+        kept = by_rule(choice)(parts)
+        return {"lost_targets_1": kept.lost.sum(-1).astype(float), "far_mass_1": kept.far}
 
     return compare_each("given", rules, progress, measure)
 
@@ -210,33 +211,28 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
 # Charts and claims.
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Fig. 8 for the first trial of seed 0; lost targets by the number of sensors and by target."""
-    measured = figures(samples)
+    measured = figures(outcomes)
     labels = {AA: "arithmetic", GA: "geometric", EXACT: "geometric, exact"}
     rows = {row: label for row, label in labels.items() if f"{row}/lost_targets_1" in measured}
-    found = [_trial_chart(rows)] if rows else []
+    panels = [_trial_chart(rows)] if rows else []
     lines = []
     for row, label in labels.items():
         names = {k: f"{row}@sensors{k}/lost_targets_1" for k in range(2, SENSORS)} | {6: f"{row}/lost_targets_1"}
         known = {k: measured[name] for k, name in names.items() if name in measured}
         if known:
-            lines.append(_series(label, known, "points" if row == EXACT else "line"))
+            lines.append(estimates(label, known, "points" if row == EXACT else "line"))
     if lines:
-        found.append(Chart("Lost targets of five", "sensors", "targets a trial", tuple(lines)))
+        panels.append(Chart("Lost targets of five", "sensors", "targets a trial", tuple(lines)))
     if rows:
         bars = tuple(
-            _series(label, {k: measured[f"{row}/lost_at_{t:.0f}_share_1"] for k, t in enumerate(TARGETS)}, "bars")
+            estimates(label, {k: measured[f"{row}/lost_at_{t:.0f}_share_1"] for k, t in enumerate(TARGETS)}, "bars")
             for row, label in rows.items()
         )
         ticks = {float(k): f"{t:.0f}" for k, t in enumerate(TARGETS)}
-        found.append(Chart("Lost by place of the target", "target at", "share of trials", bars, ticks=ticks))
-    return found
-
-
-def _series(label: str, points: Mapping[int, Estimate], style: Style) -> Series:
-    x, y = np.array(list(points), float), np.array([e.value for e in points.values()])
-    return Series(label, x, y, style, np.nan_to_num([e.standard_error for e in points.values()]))
+        panels.append(Chart("Lost by place of the target", "target at", "share of trials", bars, ticks=ticks))
+    return panels
 
 
 def _trial_chart(rows: Mapping[str, str]) -> Chart:
@@ -296,10 +292,8 @@ CLAIMS = (
 SCENARIO = Scenario(
     key="li2019-six-sensors",
     title="Intensities of six sensors that miss targets",
-    paper=PAPER + "5.2, Fig. 8",
+    paper=f"{PAPER}, 5.2, Fig. 8",
     shows="how many of five targets the averages of six intensities lose, and what false alarms they keep",
-    published={},
-    published_runs=1,
     default_runs=200,
     publication_runs=1000,
     assumptions=(
@@ -315,7 +309,7 @@ SCENARIO = Scenario(
         "@exact: without the approximation (49), point by point; @sensorsK: the first K of the six",
         "compare: what a rule gives is scaled to the sources' mean number of targets",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=CLAIMS,

@@ -87,8 +87,8 @@ def _hermite(steps_at: Array, terms: int) -> Array:
     """Hermite coefficients a_1 ... a_terms of a variable that steps up by one at each of the given deviates."""
     density = np.exp(-0.5 * steps_at**2) / np.sqrt(2.0 * np.pi)
     before, now = np.zeros_like(steps_at), np.ones_like(steps_at)  # He_k / sqrt(k!)
-    found = np.empty(terms)
+    coefficients = np.empty(terms)
     for k in range(1, terms + 1):
-        found[k - 1] = (density * now).sum() / np.sqrt(k)
+        coefficients[k - 1] = (density * now).sum() / np.sqrt(k)
         before, now = now, (steps_at * now - np.sqrt(k - 1.0) * before) / np.sqrt(k)
-    return found
+    return coefficients

@@ -10,6 +10,7 @@ import numpy as np
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.random_streams import stream
+from track_fusion.scenarios.li2019 import PAPER
 from track_fusion.scenarios.li2019.averages import (
     arithmetic_moments,
     average_moments,
@@ -18,10 +19,10 @@ from track_fusion.scenarios.li2019.averages import (
     relative_variance,
     variance_bounds,
 )
-from track_fusion.scenarios.li2019.common import PAPER, exact_samples
 from track_fusion.scenarios.li2019.variable_pairs import MEAN, VARIANCES, Variables, normal_pair, poisson_pair
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.scenario import Claim, Progress, Samples, Scenario, chosen
+from track_fusion.study.rows import Outcomes, Progress, chosen, exact_rows
+from track_fusion.study.scenario import Claim, Scenario
 
 #: Pairs of variables drawn in one run: what fits the cache at all weights.
 PAIRS = 1000
@@ -106,12 +107,12 @@ EXACT: dict[str, Callable[[], dict[str, float]]] = {
 }
 
 
-# Samples and figures.
+# Outcomes and figures.
 
 ROWS = {f"{average}@{variant}": (average, variant) for variant in VARIABLES for average in AVERAGES}
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Draw pairs and average them at every weight.
 
     Returns
@@ -120,17 +121,17 @@ def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -
     """
     wanted = chosen(ROWS | dict.fromkeys(EXACT, ("", "")), only)
     exact = {row: EXACT[row] for row in wanted if row in EXACT}
-    found = exact_samples(exact, runs, lambda share: None, "") if exact else {}
-    found |= {row: np.empty((len(runs), 2, len(WEIGHT))) for row in wanted if row in ROWS}
+    outcomes = exact_rows(exact, runs, seed, lambda share: None) if exact else {}
+    outcomes |= {row: np.empty((len(runs), 2, len(WEIGHT))) for row in wanted if row in ROWS}
     for i, run in enumerate(runs):
         normals = stream(seed, run, "pairs").standard_normal((PAIRS, 2))
         for variant, variables in VARIABLES.items():
             rows = [f"{average}@{variant}" for average in AVERAGES if f"{average}@{variant}" in wanted]
             values = variables.make(normals) if rows else normals
             for row in rows:
-                found[row][i] = _moments(values, AVERAGES[ROWS[row][0]], variables.origin)
+                outcomes[row][i] = _moments(values, AVERAGES[ROWS[row][0]], variables.origin)
         progress((i + 1) / len(runs))
-    return found
+    return outcomes
 
 
 def _moments(values: Array, geometric: bool, origin: float) -> Array:
@@ -176,71 +177,71 @@ Curve = Callable[[Array], Array]
 
 def _curves(variables: Variables) -> dict[str, Curve]:
     """What is minimised over the weights, by name: moments (..., 2, W) -> (..., W)."""
-    found: dict[str, Curve] = {"variance": variance_curve}
+    curves: dict[str, Curve] = {"variance": variance_curve}
     for truth in variables.truths:
-        found[f"mse_theta{truth}"] = functools.partial(error_curve, offset=truth - variables.origin)
-    return found
+        curves[f"mse_theta{truth}"] = functools.partial(error_curve, offset=truth - variables.origin)
+    return curves
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Least variance and mean square errors with their weights; at what share of weights the arithmetic has more."""
-    found: dict[str, Estimate] = {}
-    for name, values in samples.items():
+    measured: dict[str, Estimate] = {}
+    for name, values in outcomes.items():
         if values.ndim == 1:
-            found[name] = Estimate.exact(values[0])
+            measured[name] = Estimate.exact(values[0])
             continue
         _, variant = ROWS[name]
         for what, curve in _curves(VARIABLES[variant]).items():
-            found[f"{name}/least_{what}_1"] = Estimate.of_averages(values, lambda m, c=curve: lowest(c(m))[0])  # type: ignore[misc]
-            found[f"{name}/weight_least_{what}_1"] = Estimate.of_averages(values, lambda m, c=curve: lowest(c(m))[1])  # type: ignore[misc]
+            measured[f"{name}/least_{what}_1"] = Estimate.of_averages(values, lambda m, c=curve: lowest(c(m))[0])  # type: ignore[misc]
+            measured[f"{name}/weight_least_{what}_1"] = Estimate.of_averages(values, lambda m, c=curve: lowest(c(m))[1])  # type: ignore[misc]
         origin, half = VARIABLES[variant].origin, len(WEIGHT) // 2
-        found[f"{name}/mean_half_1"] = Estimate.of_averages(values[:, 0, half], lambda m, o=origin: m + o)  # type: ignore[misc]
+        measured[f"{name}/mean_half_1"] = Estimate.of_averages(values[:, 0, half], lambda m, o=origin: m + o)  # type: ignore[misc]
     for variant, variables in VARIABLES.items():
         rows = [f"{average}@{variant}" for average in AVERAGES]
-        if all(row in samples for row in rows):
-            found |= _comparison(rows[0], variables, np.stack([samples[row] for row in rows], 1))
-    return found
+        if all(row in outcomes for row in rows):
+            measured |= _comparison(rows[0], variables, np.stack([outcomes[row] for row in rows], 1))
+    return measured
 
 
 def _comparison(row: str, variables: Variables, both: Array) -> dict[str, Estimate]:
     """Figures that need both averages, (R, 2 averages, 2, W)."""
-    found = {}
+    measured = {}
     for what, curve in _curves(variables).items():
 
         def difference(m: Array, curve: Curve = curve) -> Array:
             return greater_share(curve(m[:, 0]) - curve(m[:, 1]))
 
-        found[f"{row}/greater_share_{what}_1"] = Estimate.of_averages(both, difference)
-    found[f"{row}/better_variance_1"] = Estimate.of_averages(
+        measured[f"{row}/greater_share_{what}_1"] = Estimate.of_averages(both, difference)
+    measured[f"{row}/better_variance_1"] = Estimate.of_averages(
         both[:, 0], lambda m: np.minimum(variance_curve(m)[:, 0], variance_curve(m)[:, -1])
     )
-    return found
+    return measured
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Figs. 1 to 4: variance and mean square error over the weight of the first variable."""
-    panels = [
+    content = [
         ("Fig. 1: variance, normal variables", [(v, "variance", VARIABLES[v].label) for v in FIGURE_1]),
         ("Fig. 2: variance, Poisson variables", [(v, "variance", VARIABLES[v].label) for v in FIGURE_2]),
         ("Fig. 3: mean square error, independent variables", _error_lines("rho0")),
         ("Fig. 4: mean square error, correlation 0.70736", _error_lines("rho70736")),
     ]
-    found = []
-    for title, lines in panels:
+    panels = []
+    for title, lines in content:
         series = tuple(
             Series(
                 f"{'geometric' if geometric else 'arithmetic'}, {label}",
                 WEIGHT,
-                _curves(VARIABLES[variant])[what](samples[f"{average}@{variant}"].mean(0)),
+                _curves(VARIABLES[variant])[what](outcomes[f"{average}@{variant}"].mean(0)),
                 "dashed" if geometric else "line",
             )
             for variant, what, label in lines
             for average, geometric in AVERAGES.items()
-            if f"{average}@{variant}" in samples
+            if f"{average}@{variant}" in outcomes
         )
         if series:
-            found.append(Chart(title, "weight of variable 1", title.split(": ")[1].split(",")[0], series))
-    return found
+            panels.append(Chart(title, "weight of variable 1", title.split(": ")[1].split(",")[0], series))
+    return panels
 
 
 def _error_lines(variant: str) -> list[tuple[str, str, str]]:
@@ -252,19 +253,14 @@ def _error_lines(variant: str) -> list[tuple[str, str, str]]:
 TIE = 1e-9
 
 
-def _no_greater(*estimates: Estimate) -> bool:
-    """Tell whether the first half of the figures are no greater than the second half, one by one."""
-    half = len(estimates) // 2
-    pairs = zip(estimates[:half], estimates[half:], strict=True)
-    return all(a.value <= b.value * (1.0 + TIE) for a, b in pairs)
+def _no_greater(text: str, source: str, variants: Sequence[str], quantity: str) -> Claim:
+    """Claim that a figure of the arithmetic average is no greater than that of the geometric, variant by variant."""
+    first, second = ([f"{average}@{v}/{quantity}" for v in variants] for average in AVERAGES)
+    return Claim.each(text, source, first, second, lambda a, b: a <= b * (1.0 + TIE))
 
 
 def _some_of_both(*shares: Estimate) -> bool:
     return all(0.0 < s.value < 1.0 for s in shares)
-
-
-def _pairs(variants: Sequence[str], quantity: str) -> tuple[str, ...]:
-    return tuple(f"{average}@{v}/{quantity}" for average in AVERAGES for v in variants)
 
 
 def _error_claims(truth: int) -> tuple[Claim, Claim]:
@@ -277,12 +273,12 @@ def _error_claims(truth: int) -> tuple[Claim, Claim]:
             shares,
             _some_of_both,
         ),
-        Claim(
+        _no_greater(
             f"Parameter {truth}: the least mean square error of the arithmetic average is no greater than that of "
             "the geometric.",
             "Remark 3",
-            _pairs(("rho0", "rho70736"), f"least_mse_theta{truth}_1"),
-            _no_greater,
+            ("rho0", "rho70736"),
+            f"least_mse_theta{truth}_1",
         ),
     )
 
@@ -321,17 +317,17 @@ CLAIMS = (
         )
         for kind, figure, variants in (("Normal", "Fig. 1", FIGURE_1), ("Poisson", "Fig. 2", FIGURE_2))
     ),
-    Claim(
+    _no_greater(
         "In Figs. 1 and 2 the least variance of the arithmetic average is no greater than that of the geometric.",
         "Remark 2",
-        _pairs(FIGURE_1 + FIGURE_2, "least_variance_1"),
-        _no_greater,
+        FIGURE_1 + FIGURE_2,
+        "least_variance_1",
     ),
-    Claim(
+    _no_greater(
         "So it is for any two variables (here two independent lognormal ones of log-variance 1).",
         "6, v-fusion, conclusion 2",
-        _pairs(("lognormal",), "least_variance_1"),
-        _no_greater,
+        ("lognormal",),
+        "least_variance_1",
     ),
     *(claim for truth in TRUTHS for claim in _error_claims(truth)),
     Claim(
@@ -359,10 +355,8 @@ CLAIMS = (
 SCENARIO = Scenario(
     key="li2019-variables",
     title="Averages of two random variables",
-    paper=PAPER + "3, Figs. 1-4",
+    paper=f"{PAPER}, 3, Figs. 1-4",
     shows="variance and mean square error of the arithmetic and the geometric average of two correlated numbers",
-    published={},
-    published_runs=1,
     default_runs=200,
     publication_runs=1000,
     assumptions=(
@@ -375,7 +369,7 @@ SCENARIO = Scenario(
         "the same normal deviates make the variables of all correlations, and both averages are taken of them",
         "least values by a parabola through the lowest of 51 weights and its neighbours",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=CLAIMS,

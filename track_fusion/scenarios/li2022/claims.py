@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.study.scenario import Claim
 
@@ -50,24 +48,14 @@ def close(text: str, source: str, share: float, to: str, *others: str) -> Claim:
     return Claim(text, source, (to, *others), holds)
 
 
-def below_each(text: str, source: str, first: Sequence[str], second: Sequence[str]) -> Claim:
-    """Claim that figures are less than their counterparts, one by one."""
-
-    def holds(*estimates: Estimate) -> bool:
-        half = len(estimates) // 2
-        return all(a.value < b.value for a, b in zip(estimates[:half], estimates[half:], strict=True))
-
-    return Claim(text, source, (*first, *second), holds)
-
-
 def union_claims(one: str, source: str) -> tuple[Claim, ...]:
     """Covariance union against the other rules, in both readings of its mean."""
     rest = named(POSITION, one, "alone", "ic", AVERAGE, INTERSECTION)
-    found = []
+    claims = []
     for union, about in ((UNION, "about the arithmetic average"), (UNION_ANYWHERE, "about the best mean")):
         name = f"{one.upper()} with covariance union {about}"
         own = named(POSITION, one, union)[0]
-        found += [
+        claims += [
             Claim.greatest(f"{name} is worse than every row but naive fusion", source, own, rest),
             Claim.order(f"{name} is worse than the arithmetic average", source, *named(POSITION, one, AVERAGE), own),
             Claim(
@@ -77,7 +65,7 @@ def union_claims(one: str, source: str) -> tuple[Claim, ...]:
                 lambda first, *others: first.value > max(1.0, *(e.value for e in others)),
             ),
         ]
-    return tuple(found)
+    return tuple(claims)
 
 
 def balance_claims(one: str, source: str) -> tuple[Claim, ...]:

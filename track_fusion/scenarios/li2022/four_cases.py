@@ -19,8 +19,11 @@ from track_fusion.rules.fault_tolerant_covariance_intersection import FaultToler
 from track_fusion.rules.geometric_average import GeometricAverageParams
 from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
 from track_fusion.rules.naive import NaiveParams
+from track_fusion.scenarios.li2022 import PAPER
 from track_fusion.study.chart import Chart, ellipse
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario, chosen, compare_each
+from track_fusion.study.rows import Outcomes, Progress, chosen, row_by_row
+from track_fusion.study.rule_choice import RuleChoice, compare_each
+from track_fusion.study.scenario import Claim, Scenario
 
 #: The densities of Fig. 1 are not printed. This pair is assumed: trace-optimal covariance intersection gives it the
 #: paper's weight w1 = .3764.
@@ -31,7 +34,7 @@ SEPARATIONS = {"a": 0.5, "b": 2.0, "c": 4.5, "d": 8.0}
 SECTION_2E = {f"given-covariance_intersection/weight_case_{case}_1": 0.3764 for case in SEPARATIONS}
 
 #: The schemes of Fig. 1.
-PAPER = (
+SCHEMES = (
     RuleChoice("naive", NaiveParams()),
     RuleChoice("geometric_average", GeometricAverageParams()),
     RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="trace")),
@@ -49,13 +52,13 @@ CHAIN = (
 
 def enough_for_two() -> list[Rule]:
     """Rules that two tracks are enough for, in the order of the registry."""
-    return [rule for rule in RULES.values() if not rule.needed(rule.params())]
+    return [rule for rule in RULES.own.values() if not rule.needed(rule.params())]
 
 
-_NAMED = {choice.key for choice in (*PAPER, *CHAIN)}
+_NAMED = {choice.key for choice in (*SCHEMES, *CHAIN)}
 #: All other rules, as they are by default.
 OTHERS = tuple(RuleChoice(rule.key, rule.params()) for rule in enough_for_two() if rule.key not in _NAMED)
-RULE_CHOICES = (*PAPER, *CHAIN, *OTHERS)
+RULE_CHOICES = (*SCHEMES, *CHAIN, *OTHERS)
 #: Traces that are equal may differ by rounding, relative.
 ROUNDING = 1e-12
 #: Ellipses of so many other rules in one picture.
@@ -80,23 +83,16 @@ def all_cases() -> SourceTracks:
     return SourceTracks(np.stack([p.mean for p in pairs]), np.stack([p.cov for p in pairs]))
 
 
-def draws(choice: RuleChoice | None) -> bool:
-    """Whether the rule samples, so that each run has a result of its own."""
-    return choice is not None and RULES[choice.key].uses("seed", choice.params)
-
-
 def fused(row: str, choice: RuleChoice | None, seed: int, run: int) -> FusedTracks:
     """Fuse all cases; a rule that samples draws anew in each run."""
     tracks = all_cases()
     if choice is None:
         at = TRACKS.index(row)
         return FusedTracks(tracks.mean[:, at], tracks.cov[:, at])
-    if draws(choice):
-        tracks = dataclasses.replace(tracks, extras={"seed": stream(seed, run, "fusion_centre")})
-    return RULES[choice.key](tracks, choice.params)
+    return choice.fuse(dataclasses.replace(tracks, extras={"seed": stream(seed, run, "fusion_centre")}))
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Fuse by the rows whose names start with `only`.
 
     Returns
@@ -104,22 +100,22 @@ def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -
     By row: mean (R, 4, 2), cov (R, 4, 2, 2), the weight on track 1 (R, 4) where there is one; of the mixture the
     number of its modes (R, 4)
     """
-    rows, found = chosen(ROWS, only), {}
-    for done, (row, choice) in enumerate(rows.items()):
-        each = [fused(row, choice, seed, run) for run in (runs if draws(choice) else runs[:1])]
+
+    def measure(row: str) -> Outcomes:
+        each = [fused(row, ROWS[row], seed, run) for run in (runs if _random(row) else runs[:1])]
         each *= len(runs) // len(each)
         if row == MIXTURE:
-            found[f"{row}/modes"] = np.array([modes(f.mixture) for f in each])
-        else:
-            found[f"{row}/mean"], found[f"{row}/cov"] = (
-                np.stack([f.mean for f in each]),
-                np.stack([f.cov for f in each]),
-            )
-            weights = [f.weights[:, 0] for f in each if f.weights is not None]
-            if weights:
-                found[f"{row}/weight"] = np.stack(weights)
-        progress((done + 1) / len(rows))
-    return found
+            return {"modes": np.array([modes(f.mixture) for f in each])}
+        weights = [f.weights[:, 0] for f in each if f.weights is not None]
+        columns = {"mean": np.stack([f.mean for f in each]), "cov": np.stack([f.cov for f in each])}
+        return columns | ({"weight": np.stack(weights)} if weights else {})
+
+    return row_by_row({row: row for row in chosen(ROWS, only)}, progress, measure)
+
+
+def _random(row: str) -> bool:
+    choice = ROWS[row]
+    return choice is not None and choice.random
 
 
 def modes(pairs: Mixture | None) -> Array:
@@ -139,27 +135,27 @@ def modes(pairs: Mixture | None) -> Array:
     return np.asarray((rising[..., :-1] & ~rising[..., 1:]).sum(-1) + ~rising[..., 0] + rising[..., -1], np.float64)
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Trace and determinant by rule and case, the weight on track 1, and the modes of the mixture."""
-    found = {}
-    for name, values in samples.items():
+    measured = {}
+    for name, values in outcomes.items():
         row, _, what = name.rpartition("/")
         for i, case in enumerate(SEPARATIONS):
             if what == "cov":
                 cov = values[:, i]
-                found[f"{row}/trace_case_{case}_m2"] = _over_runs(row, np.trace(cov, axis1=1, axis2=2))
-                found[f"{row}/determinant_case_{case}_m4"] = _over_runs(row, np.linalg.det(cov))
+                measured[f"{row}/trace_case_{case}_m2"] = _over_runs(row, np.trace(cov, axis1=1, axis2=2))
+                measured[f"{row}/determinant_case_{case}_m4"] = _over_runs(row, np.linalg.det(cov))
             elif what in ("weight", "modes"):
-                found[f"{row}/{what}_case_{case}_1"] = _over_runs(row, values[:, i])
-    return found
+                measured[f"{row}/{what}_case_{case}_1"] = _over_runs(row, values[:, i])
+    return measured
 
 
 def _over_runs(row: str, values: Array) -> Estimate:
     """Average (R,) of what a rule gives, which is exact where nothing is drawn."""
-    return Estimate.mean(values) if draws(ROWS[row]) else Estimate.exact(values[0])
+    return Estimate.mean(values) if _random(row) else Estimate.exact(values[0])
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Trace of the fused covariance by case, (R,), under any rules: what is claimed, which need not be true.
 
     Raises
@@ -167,29 +163,29 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
     ParameterError    a rule needs more than the tracks
     """
 
-    def measure(choice: RuleChoice) -> Samples:
+    def measure(choice: RuleChoice) -> Outcomes:
         traces = np.array([np.trace(fused("", choice, seed, r).cov, axis1=1, axis2=2) for r in runs])
         return {f"trace_case_{case}_m2": traces[:, i] for i, case in enumerate(SEPARATIONS)}
 
     return compare_each("given", rules, progress, measure)
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Ellipses of one standard deviation: the schemes of Fig. 1 in each case, then all other rules."""
     others = [f"given-{choice.name}" for choice in (*CHAIN, *OTHERS)]
-    groups = [[f"given-{choice.name}" for choice in PAPER]]
+    groups = [[f"given-{choice.name}" for choice in SCHEMES]]
     groups += [others[i : i + IN_A_PICTURE] for i in range(0, len(others), IN_A_PICTURE)]
-    pictures = [_picture(case, group, samples) for group in groups for case in SEPARATIONS]
+    pictures = [_picture(case, group, outcomes) for group in groups for case in SEPARATIONS]
     return [picture for picture in pictures if len(picture.series) > len(TRACKS)]
 
 
-def _picture(case: str, rows: Iterable[str], samples: Samples) -> Chart:
+def _picture(case: str, rows: Iterable[str], outcomes: Outcomes) -> Chart:
     at = list(SEPARATIONS).index(case)
     pair = two_tracks(SEPARATIONS[case])
     lines = [ellipse(f"P{i + 1}", pair.mean[i], pair.cov[i], 1.0, "dashed") for i in range(pair.count)]
     for row in rows:
-        if f"{row}/mean" in samples:
-            mean, cov = samples[f"{row}/mean"][0, at], samples[f"{row}/cov"][0, at]
+        if f"{row}/mean" in outcomes:
+            mean, cov = outcomes[f"{row}/mean"][0, at], outcomes[f"{row}/cov"][0, at]
             lines.append(ellipse(row.partition("-")[2], mean, cov, 1.0))
     title = f"({case}) means {SEPARATIONS[case]:g} m apart along x, one-sigma ellipses"
     return Chart(title, "x / m", "y / m", tuple(lines), equal=True)
@@ -211,7 +207,7 @@ def _ascend(traces: Array) -> bool:
 
 
 def _claims() -> tuple[Claim, ...]:
-    naive, geometric, intersection, average, lower, upper = (f"given-{choice.name}" for choice in PAPER)
+    naive, geometric, intersection, average, lower, upper = (f"given-{choice.name}" for choice in SCHEMES)
     inverse, tolerant, _ = (f"given-{choice.name}" for choice in CHAIN)
     apart = [
         Claim(
@@ -259,10 +255,9 @@ def _claims() -> tuple[Claim, ...]:
 SCENARIO = Scenario(
     key="li2022-four-cases",
     title="Two Gaussian tracks at four separations, fused by every rule",
-    paper="Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average Density Fusion, Fig. 1",
+    paper=f"{PAPER}, Fig. 1",
     shows="how much each rule inflates the covariance, and which rules see that the tracks contradict each other",
     published=SECTION_2E,
-    published_runs=1,
     default_runs=20,
     publication_runs=100,
     assumptions=(
@@ -273,7 +268,7 @@ SCENARIO = Scenario(
         "trace, rules that Fig. 1 does not show have their default parameters",
         "runs count only for the rules that sample, whose draws differ from run to run",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=_claims(),

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-
 import numpy as np
 
-from track_fusion.filters.kalman import predict, update, update_joint
-from track_fusion.linalg import Array
+from track_fusion.filters.kalman import Kalman
+from track_fusion.filters.particle import SirParams
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
-from track_fusion.rules import RULES, FusedTracks
+from track_fusion.scenarios.li2022 import PAPER
 from track_fusion.scenarios.li2022.claims import (
     ASSUMPTIONS,
     AVERAGE,
@@ -19,7 +17,6 @@ from track_fusion.scenarios.li2022.claims import (
     POSITION,
     VELOCITY,
     balance_claims,
-    below_each,
     close,
     named,
     union_claims,
@@ -28,9 +25,11 @@ from track_fusion.scenarios.li2022.claims import (
 from track_fusion.scenarios.li2022.claims import (
     RULES as ROWS,
 )
-from track_fusion.study.one_target import RULE_CHOICES, Row, Sir, fusion_streams, sir_rows
+from track_fusion.study.one_target import RULE_CHOICES, Row, alone_row, fused_row, same_filters, sir_rows
 from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
-from track_fusion.study.scenario import Claim, Printed, RuleChoice, Scenario, Tracking, fuse_runs
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Claim, Printed, Scenario
+from track_fusion.study.scene import Tracking
 from track_fusion.tracks import planar_layout
 
 #: Table I: ARMSE of position (m) and velocity (m/s).
@@ -52,7 +51,7 @@ TABLE_1 = {
 SECTION_4A = {"kf-arithmetic_average/sensor_1_weight_1": 0.575}
 LAYOUT = planar_layout()
 QUANTITIES = (Quantity("position", "m", LAYOUT.position), Quantity("velocity", "mps", LAYOUT.velocity))
-SIR = Sir(200)
+KF, SIR = same_filters(Kalman()), SirParams(particles=200)
 
 MOTION = NearlyConstantVelocity(LAYOUT, MotionParams(noise_form="piecewise_constant", process_noise=5.0))
 SENSORS = {"sensor_1": LinearSensor.position(LAYOUT, 20.0), "sensor_2": LinearSensor.position(LAYOUT, 40.0)}
@@ -66,48 +65,14 @@ TRACKING = Tracking(
 )
 
 
-def _start(runs: int) -> tuple[Array, Array]:
-    """State of all runs, (R, n), and its covariance, (1, n, n), which they share as long as it depends on no data."""
-    return np.tile(TRACKING.initial_mean, (runs, 1)), TRACKING.initial_cov[None]
-
-
-def one_filter(seen: Sequence[Array]) -> Iterator[FusedTracks]:
-    """One filter that uses the measurements of the given sensors, (R, T, m) each, jointly."""
-    sensors = list(SENSORS.values())[: len(seen)]
-    mean, cov = _start(len(seen[0]))
-    for k in range(TRACKING.steps):
-        mean, cov = predict(mean, cov, *MOTION.matrices(TRACKING.dt_s))
-        z = [s[:, k] for s in seen]
-        mean, cov, _ = update_joint(mean, cov, z, [s.matrix for s in sensors], [s.noise for s in sensors])
-        yield FusedTracks(mean, cov)
-
-
-def fused_filters(
-    choice: RuleChoice, seen: Sequence[Array], rngs: Sequence[np.random.Generator] | None = None
-) -> Iterator[FusedTracks]:
-    """One filter a sensor, fused after each step, the fused posterior fed back to all of them.
-
-    `rngs`: a generator a run, for a rule that samples.
-    """
-    rule, sensors = RULES[choice.key], list(SENSORS.values())
-    mean, cov = _start(len(seen[0]))
-    for k in range(TRACKING.steps):
-        mean, cov = predict(mean, cov, *MOTION.matrices(TRACKING.dt_s))
-        local = [update(mean, cov, z[:, k], s.matrix, s.noise)[:2] for z, s in zip(seen, sensors, strict=True)]
-        means, covs = (np.stack(parts, 1) for parts in zip(*local, strict=True))
-        fused = fuse_runs(rule, choice.params, means, covs, rngs)
-        mean, cov = fused.mean, fused.cov
-        yield fused
-
-
 def kalman_row(choice: RuleChoice) -> Row:
     """Two Kalman filters fused by any rule."""
-    return Row(lambda sample: fused_filters(choice, sample.seen, fusion_streams(sample)))
+    return fused_row(TRACKING, KF, choice)
 
 
 def kalman_rows() -> dict[str, Row]:
     """Rows of Table I by Kalman filters."""
-    table = {"kf-alone": Row(lambda s: one_filter(s.seen[:1])), "kf-ic": Row(lambda s: one_filter(s.seen))}
+    table = {"kf-alone": alone_row(TRACKING, KF, 1), "kf-ic": alone_row(TRACKING, KF, 2)}
     return table | {f"kf-{choice.name}": kalman_row(choice) for choice in RULE_CHOICES}
 
 
@@ -125,18 +90,19 @@ _OTHERS = ("alone", "ic", AVERAGE, INTERSECTION, "covariance_union")
 
 
 def _claims() -> tuple[Claim, ...]:
-    found = [
+    claims = [
         Claim.least(
             "KF with both sensors' measurements (IC) is the best row of all",
             "IV-A",
             f"kf-ic/{POSITION}",
             [n for one in ("kf", "sir") for n in named(POSITION, one, *ROWS) if n != f"kf-ic/{POSITION}"],
         ),
-        below_each(
+        Claim.each(
             "the Kalman filter does better than the particle filter with every rule and alone",
             "IV-A",
             named(POSITION, "kf", *ROWS),
             named(POSITION, "sir", *ROWS),
+            float.__lt__,
         ),
         Claim(
             "KF-IC is Bayes-optimal: what it claims is its mean squared error (credibility within 5 % of 1)",
@@ -148,7 +114,7 @@ def _claims() -> tuple[Claim, ...]:
     for one in ("kf", "sir"):
         name = one.upper()
         ic, average, intersection = named(POSITION, one, "ic", AVERAGE, INTERSECTION)
-        found += [
+        claims += [
             Claim.greatest(
                 f"{name} with naive fusion is the worst row, worse than sensor 1 alone",
                 "IV-A",
@@ -167,20 +133,20 @@ def _claims() -> tuple[Claim, ...]:
             *union_claims(one, "IV-A"),
             *balance_claims(one, "IV-A"),
         ]
-    return (*found, *weight_claims("kf", "IV-A, Fig. 6"))
+    return (*claims, *weight_claims("kf", "IV-A, Fig. 6"))
 
 
 SCENARIO = Scenario(
     key="li2022-linear",
     title="Two position sensors, one target, linear and Gaussian",
-    paper="Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average Density Fusion, IV-A",
+    paper=f"{PAPER}, IV-A",
     shows="what fusing with unknown correlation costs and gains when the fused posterior is fed back to both filters",
     published=published(TABLE_1, QUANTITIES) | SECTION_4A,
     published_runs=100,
     default_runs=150,
     publication_runs=1000,
     assumptions=ASSUMPTIONS,
-    sample=STUDY.sample,
+    simulate=STUDY.simulate,
     figures=STUDY.figures,
     charts=STUDY.charts,
     claims=_claims(),

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from track_fusion.filters import cubature
+from track_fusion.filters.cubature import Cubature
+from track_fusion.filters.particle import SirParams
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
+from track_fusion.scenarios.li2022 import PAPER
 from track_fusion.scenarios.li2022.claims import (
     ASSUMPTIONS,
     AVERAGE,
@@ -14,23 +16,16 @@ from track_fusion.scenarios.li2022.claims import (
     POSITION,
     UNION,
     balance_claims,
-    below_each,
     close,
     named,
     union_claims,
     weight_claims,
 )
-from track_fusion.study.one_target import (
-    RULE_CHOICES,
-    GaussianFilter,
-    Row,
-    Sir,
-    gaussian_alone,
-    gaussian_fused,
-    sir_rows,
-)
+from track_fusion.study.one_target import RULE_CHOICES, Row, alone_row, fused_row, same_filters, sir_rows
 from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
-from track_fusion.study.scenario import Claim, Printed, RuleChoice, Scenario, Tracking
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Claim, Printed, Scenario
+from track_fusion.study.scene import Tracking
 from track_fusion.tracks import StateLayout
 
 #: Table II: ARMSE of position (m), velocity (m/s) and turn rate (deg/s). Of CKF-NF the text has "2 15.76".
@@ -59,8 +54,7 @@ QUANTITIES = (
     Quantity("velocity", "mps", LAYOUT.velocity),
     Quantity("turn_rate", "degps", (4,), float(np.degrees(1.0))),
 )
-CKF = GaussianFilter(cubature.predict, cubature.update)
-SIR = Sir(500)
+CKF, SIR = same_filters(Cubature()), SirParams(particles=500)
 
 TRACKING = Tracking(
     motion=CoordinatedTurn(LAYOUT, CoordinatedTurnParams(process_noise=0.1, turn_rate_noise=1e-4)),
@@ -77,12 +71,12 @@ TRACKING = Tracking(
 
 def cubature_row(choice: RuleChoice) -> Row:
     """Two cubature Kalman filters fused by any rule."""
-    return gaussian_fused(TRACKING, CKF, choice)
+    return fused_row(TRACKING, CKF, choice)
 
 
 def cubature_rows() -> dict[str, Row]:
     """Rows of Table II by cubature Kalman filters."""
-    table = {"ckf-alone": gaussian_alone(TRACKING, CKF, 1), "ckf-ic": gaussian_alone(TRACKING, CKF, 2)}
+    table = {"ckf-alone": alone_row(TRACKING, CKF, 1), "ckf-ic": alone_row(TRACKING, CKF, 2)}
     return table | {f"ckf-{choice.name}": cubature_row(choice) for choice in RULE_CHOICES}
 
 
@@ -103,7 +97,7 @@ LOST = 3.0
 def _claims() -> tuple[Claim, ...]:
     first, last = named("sensor_1_weight_first_1", "ckf", AVERAGE), named("sensor_1_weight_last_1", "ckf", AVERAGE)
     but_ic = ("alone", "naive", AVERAGE, INTERSECTION, UNION)
-    found = [
+    claims = [
         Claim.order(
             "SIR with both sensors' measurements (IC) is worse than CKF-IC, and even than SIR with covariance union",
             "IV-B",
@@ -111,24 +105,25 @@ def _claims() -> tuple[Claim, ...]:
             f"sir-{UNION}/{POSITION}",
             f"sir-ic/{POSITION}",
         ),
-        below_each(
+        Claim.each(
             "the particle filter does better than the cubature filter with every rule and alone, except IC",
             "IV-B",
             named(POSITION, "sir", *but_ic),
             named(POSITION, "ckf", *but_ic),
+            float.__lt__,
         ),
         Claim.order("the weight on sensor 1 falls from the first step to the last", "IV-B, Fig. 11", *last, *first),
         *weight_claims("ckf", "IV-B, Fig. 11"),
     ]
     for rule in (AVERAGE, INTERSECTION):
         names = [f"{one}-{rule}/{POSITION}" for one in ("ckf", "sir")]
-        found.append(
+        claims.append(
             close(f"particles do not degenerate under {rule}: SIR is within 8 % of CKF", "IV-B", CLOSE, *names)
         )
     for one in ("ckf", "sir"):
         name, naive = one.upper(), f"{one}-naive/{POSITION}"
         best = named(POSITION, one, AVERAGE, INTERSECTION)
-        found += [
+        claims += [
             Claim.greatest(
                 f"{name} with naive fusion loses the target: three times the error of every other row",
                 "IV-B, Fig. 7",
@@ -159,13 +154,13 @@ def _claims() -> tuple[Claim, ...]:
             *union_claims(one, "IV-B"),
             *balance_claims(one, "IV-B"),
         ]
-    return tuple(found)
+    return tuple(claims)
 
 
 SCENARIO = Scenario(
     key="li2022-nonlinear",
     title="Two range-bearing sensors, one turning target",
-    paper="Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average Density Fusion, IV-B",
+    paper=f"{PAPER}, IV-B",
     shows="cubature and particle filters under fusion with feedback; how naive fusion loses the target",
     published=published(TABLE_2, QUANTITIES) | SECTION_4B,
     published_runs=100,
@@ -176,7 +171,7 @@ SCENARIO = Scenario(
         "the transition uses the turn rate before the step; the process noise is block-diagonal; sigma_theta is "
         "positive; bearings by atan2, residuals wrapped",
     ),
-    sample=STUDY.sample,
+    simulate=STUDY.simulate,
     figures=STUDY.figures,
     charts=STUDY.charts,
     claims=_claims(),

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 import numpy as np
 
 from track_fusion.densities.gaussian import kl_divergence
-from track_fusion.densities.mixture.divergence import kl_on_grid
-from track_fusion.densities.mixture.mixture import Mixture, log_pdf
+from track_fusion.densities.mixture.mixture import Mixture, gaussian, log_pdf
+from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.rules import RULES, FusedTracks, SourceTracks
+from track_fusion.rules import FusedTracks, SourceTracks
 from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
-from track_fusion.study.chart import Chart, Series
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario, chosen, compare_each
+from track_fusion.scenarios.li2022 import PAPER
+from track_fusion.study.chart import Chart, Series, Style
+from track_fusion.study.rows import Outcomes, Progress, exact_rows
+from track_fusion.study.rule_choice import RuleChoice, compare_each
+from track_fusion.study.scenario import Claim, Scenario
 
 #: Section III-B: mean and variance of the densities and of the target in each case.
 DENSITIES = np.array([[40.0, 400.0], [50.0, 200.0], [60.0, 100.0], [100.0, 400.0]])
@@ -39,36 +42,27 @@ BEST, OTHERS = RULE_CHOICES[0], RULE_CHOICES[1:]
 ROUNDING = 1e-9
 
 
-@dataclasses.dataclass(frozen=True)
-class Row:
-    """A density and how far it is from the target of a case.
+def alone(case: str, density: int) -> dict[str, Array]:
+    """How far a density by itself, counted from 0, is from the target of a case, in nats."""
+    return {"kld": divergence(DENSITIES[density, :1], DENSITIES[density, 1:, None], case)}
 
-    Attributes
-    ----------
-    case : str
-    choice : RuleChoice | None    whose weights the densities are mixed at; None = a density by itself
-    density : int                 that density, counted from 0
-    merged : bool                 whether the mixture is made one Gaussian
-    """
 
-    case: str
-    choice: RuleChoice | None = None
-    density: int = 0
-    merged: bool = True
-
-    def measure(self) -> dict[str, Array]:
-        """Divergence from the target in nats, and of the best average what the paper prints."""
-        if self.choice is None:
-            return {"kld": divergence(DENSITIES[self.density, :1], DENSITIES[self.density, 1:, None], self.case)}
-        fused = fit(self.choice, self.case)
+def merged(case: str, choice: RuleChoice) -> dict[str, Array]:
+    """How far the mixture at a rule's weights, made one Gaussian, is from the target; of the best what is printed."""
+    fused = fit(choice, case)
+    measured = {"kld": divergence(fused.mean, fused.cov, case)}
+    if choice is BEST:
         assert fused.weights is not None
-        if not self.merged:
-            each = [divergence(one[:1], one[1:, None], self.case) for one in DENSITIES]
-            return {"kld": np.array(mixed_divergence(fused.weights, self.case)), "mean_kld": fused.weights @ each}
-        found = {"kld": divergence(fused.mean, fused.cov, self.case)}
-        if self.choice is BEST:
-            found |= {"mean": fused.mean[0], "variance": fused.cov[0, 0], "weights": fused.weights}
-        return found
+        measured |= {"mean": fused.mean[0], "variance": fused.cov[0, 0], "weights": fused.weights}
+    return measured
+
+
+def not_merged(case: str) -> dict[str, Array]:
+    """How far the mixture at the best weights is from the target, and its components on average."""
+    weights = fit(BEST, case).weights
+    assert weights is not None
+    each = [divergence(one[:1], one[1:, None], case) for one in DENSITIES]
+    return {"kld": np.array(mixed_divergence(weights, case)), "mean_kld": weights @ each}
 
 
 def best(case: str) -> str:
@@ -86,26 +80,33 @@ def singles(case: str) -> list[str]:
     return [f"given-alone@density_{i}_case_{case}" for i in range(1, len(DENSITIES) + 1)]
 
 
-def rows() -> dict[str, Row]:
+def _rows() -> dict[str, Callable[[], dict[str, Array]]]:
     """Every row: the best average merged and not, those at other weights, and the densities themselves."""
-    found = {}
+    rows: dict[str, Callable[[], dict[str, Array]]] = {}
     for case in TARGETS:
-        found[best(case)], found[mixture(case)] = Row(case, BEST), Row(case, BEST, merged=False)
-        found |= {f"given-{c.key}@{c.variant}_case_{case}": Row(case, c) for c in OTHERS}
-        found |= {name: Row(case, density=i) for i, name in enumerate(singles(case))}
-    return found
+        rows[best(case)], rows[mixture(case)] = partial(merged, case, BEST), partial(not_merged, case)
+        rows |= {f"given-{c.key}@{c.variant}_case_{case}": partial(merged, case, c) for c in OTHERS}
+        rows |= {name: partial(alone, case, i) for i, name in enumerate(singles(case))}
+    return rows
+
+
+ROWS = _rows()
 
 
 def target_of(case: str) -> Mixture:
     """Return the target of a case, (1,) component."""
-    mean, variance = TARGETS[case]
-    return Mixture(np.ones(1), np.array([[mean]]), np.array([[[variance]]]))
+    return scalar_gaussian(*TARGETS[case])
+
+
+def scalar_gaussian(mean: float, variance: float) -> Mixture:
+    """Make a Gaussian of one axis, (1,) component."""
+    return gaussian(np.array([mean]), np.array([[variance]]))
 
 
 def fit(choice: RuleChoice, case: str) -> FusedTracks:
     """Fuse the four densities by any rule that the target is enough for."""
     tracks = SourceTracks(DENSITIES[:, :1], DENSITIES[:, 1:, None], extras={"target": target_of(case)})
-    return RULES[choice.key](tracks, choice.params)
+    return choice.fuse(tracks)
 
 
 def divergence(mean: Array, cov: Array, case: str) -> Array:
@@ -117,32 +118,22 @@ def divergence(mean: Array, cov: Array, case: str) -> Array:
 def mixed_divergence(weights: Array, case: str) -> float:
     """Divergence of the mixture at weights (4,) from the target, in nats, by summation over POINTS."""
     mixed, target = Mixture(weights, DENSITIES[:, :1], DENSITIES[:, 1:, None]), target_of(case)
-    return kl_on_grid(lambda x: log_pdf(mixed, x), lambda x: log_pdf(target, x), POINTS)
+    return float(kl_on_grid(log_pdf(mixed, POINTS), log_pdf(target, POINTS)))
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
-    """Measure the rows whose names start with `only`, (R, ...) each; nothing is random."""
-    wanted = chosen(rows(), only)
-    found: Samples = {}
-    for done, (name, row) in enumerate(wanted.items()):
-        found |= {f"{name}/{what}": np.stack([np.asarray(value)] * len(runs)) for what, value in row.measure().items()}
-        progress((done + 1) / len(wanted))
-    return found
-
-
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Divergences, moments, and the weights where they are unique."""
-    found = {}
-    for name, values in samples.items():
+    measured = {}
+    for name, values in outcomes.items():
         row, _, what = name.rpartition("/")
         if what != "weights":
-            found[f"{name}_{'nats' if what.endswith('kld') else '1'}"] = Estimate.exact(values[0])
-        elif rows()[row].case in WEIGHTS:
-            found |= {f"{row}/weight_{i}_1": Estimate.exact(w) for i, w in enumerate(values[0], 1)}
-    return found
+            measured[f"{name}_{'nats' if what.endswith('kld') else '1'}"] = Estimate.exact(values[0])
+        elif row.rpartition("_")[2] in WEIGHTS:
+            measured |= {f"{row}/weight_{i}_1": Estimate.exact(w) for i, w in enumerate(values[0], 1)}
+    return measured
 
 
-def compare(choices: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+def compare(choices: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Divergence of the fused Gaussian from the target by case, (R,), under any rules; nothing is random.
 
     Raises
@@ -150,7 +141,7 @@ def compare(choices: Sequence[RuleChoice], runs: Sequence[int], seed: int, progr
     ParameterError    a rule needs more than the densities and the target
     """
 
-    def measure(choice: RuleChoice) -> Samples:
+    def measure(choice: RuleChoice) -> Outcomes:
         fits = {case: fit(choice, case) for case in TARGETS}
         values = {case: divergence(fused.mean, fused.cov, case) for case, fused in fits.items()}
         return {f"kld_case_{case}_nats": np.full(len(runs), value) for case, value in values.items()}
@@ -158,40 +149,39 @@ def compare(choices: Sequence[RuleChoice], runs: Sequence[int], seed: int, progr
     return compare_each("given", choices, progress, measure, ("target",))
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """The densities, the target and the best fit, merged and not, in each case; then the weights."""
-    cases = [case for case in TARGETS if f"{best(case)}/weights" in samples]
+    cases = [case for case in TARGETS if f"{best(case)}/weights" in outcomes]
     numbers = np.arange(1.0, len(DENSITIES) + 1)
     bars = [
-        Series(f"case {case}", numbers, samples[f"{best(case)}/weights"][0], "bars")
+        Series(f"case {case}", numbers, outcomes[f"{best(case)}/weights"][0], "bars")
         for case in cases
         if case in WEIGHTS
     ]
     title, ticks = "Optimal weights (of case 1 they are not unique)", {float(n): f"f{n:g}" for n in numbers}
     weights = [Chart(title, "density", "weight", tuple(bars), ticks=ticks)] if bars else []
-    return [_densities(case, samples) for case in cases] + weights
+    return [_densities(case, outcomes) for case in cases] + weights
 
 
-def _densities(case: str, samples: Samples) -> Chart:
+def _densities(case: str, outcomes: Outcomes) -> Chart:
     x, target = POINTS[DRAWN], TARGETS[case]
-    lines = [Series(f"f{i}", x[:, 0], _gaussian(x, *one), "dotted") for i, one in enumerate(DENSITIES, 1)]
-    mean, variance, weights = (samples[f"{best(case)}/{what}"][0] for what in ("mean", "variance", "weights"))
+
+    def line(label: str, moments: Iterable[float], style: Style = "line") -> Series:
+        return Series(label, x[:, 0], np.exp(log_pdf(scalar_gaussian(*moments), x)), style)
+
+    lines = [line(f"f{i}", one, "dotted") for i, one in enumerate(DENSITIES, 1)]
+    mean, variance, weights = (outcomes[f"{best(case)}/{what}"][0] for what in ("mean", "variance", "weights"))
     lines += [
-        Series("target", x[:, 0], _gaussian(x, *target)),
-        Series("best average, merged", x[:, 0], _gaussian(x, mean, variance), "dashed"),
-        Series("the same before merging", x[:, 0], weights @ np.stack([line.y for line in lines])),
+        line("target", target),
+        line("best average, merged", (mean, variance), "dashed"),
+        Series("the same before merging", x[:, 0], weights @ np.stack([one.y for one in lines])),
     ]
     return Chart(f"Case {case}: target N({target[0]:g}, {target[1]:g})", "x", "density", tuple(lines))
 
 
-def _gaussian(x: Array, mean: float, variance: float) -> Array:
-    one = Mixture(np.ones(1), np.array([[mean]]), np.array([[[variance]]]))
-    return np.exp(log_pdf(one, x))
-
-
 def _claims_of(case: str) -> list[Claim]:
     alone = tuple(f"{name}/kld_nats" for name in singles(case))
-    found = [
+    claims = [
         Claim.order(
             f"case {case}: the mixture diverges less than its components do on average (32)",
             "III-A, Lemma 5",
@@ -200,7 +190,7 @@ def _claims_of(case: str) -> list[Claim]:
         )
     ]
     for row, how in ((best(case), "merged"), (mixture(case), "not merged")):
-        found.append(
+        claims.append(
             Claim(
                 f"case {case}: the average, {how}, fits the target better than the best single density",
                 "III-B, Fig. 2",
@@ -208,7 +198,7 @@ def _claims_of(case: str) -> list[Claim]:
                 lambda first, *rest: first.value < min(e.value for e in rest) - ROUNDING,
             )
         )
-    return found
+    return claims
 
 
 def _claims() -> tuple[Claim, ...]:
@@ -230,28 +220,25 @@ def _claims() -> tuple[Claim, ...]:
 
 
 def _published() -> dict[str, float]:
-    found = {f"{best(case)}/weight_{i}_1": w for case, ws in WEIGHTS.items() for i, w in enumerate(ws, 1)}
+    printed = {f"{best(case)}/weight_{i}_1": w for case, ws in WEIGHTS.items() for i, w in enumerate(ws, 1)}
     for case, (mean, variance) in MOMENTS.items():
-        found |= {f"{best(case)}/mean_1": mean, f"{best(case)}/variance_1": variance}
-    return found
+        printed |= {f"{best(case)}/mean_1": mean, f"{best(case)}/variance_1": variance}
+    return printed
 
 
 SCENARIO = Scenario(
     key="li2022-target-fit",
     title="Four densities on a line mixed to fit a target, in four cases",
-    paper="Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average Density Fusion, Fig. 2",
+    paper=f"{PAPER}, Fig. 2",
     shows="that a mixture can fit a target better than its best component, and what the best weights are",
     published=_published(),
-    published_runs=1,
-    default_runs=1,
-    publication_runs=1,
     assumptions=(
         "the weights minimise the divergence (39) of the merged Gaussian, not that of the mixture (33)",
         "in case 1 every point of a segment of weights is optimal: the moments are compared, the weights are not",
         "the exact variance of case 3 is 635.975: its print is one unit of the last digit off",
         "densities have no unit",
     ),
-    sample=sample,
+    simulate=partial(exact_rows, ROWS),
     figures=figures,
     charts=charts,
     claims=_claims(),

@@ -1,0 +1,3 @@
+"""The published studies of one paper."""
+
+PAPER = "Sharma et al., Harmonic Mean Density Fusion in Distributed Tracking"

@@ -8,16 +8,17 @@ from functools import cached_property
 
 import numpy as np
 
-from track_fusion.densities.mean_density import Kind, log_mean_density
-from track_fusion.densities.mixture.divergence import grid, kl_on_grid, moments_on_grid
-from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments
+from track_fusion.densities.mixture.mean_density import Kind, log_mean_density
+from track_fusion.densities.mixture.mixture import Mixture, log_pdf
+from track_fusion.densities.on_grid import grid, kl_on_grid, moments_on_grid
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.random_streams import stream
-from track_fusion.rules import RULES, FusedTracks, SourceTracks
+from track_fusion.rules import FusedTracks, SourceTracks
 from track_fusion.rules.geometric_mean_sampling import GeometricMeanSamplingParams
 from track_fusion.rules.harmonic_mean import HarmonicMeanParams
-from track_fusion.study.scenario import Progress, RuleChoice, Samples, check_needs, chosen
+from track_fusion.study.rows import Outcomes, Progress, chosen, row_by_row
+from track_fusion.study.rule_choice import RuleChoice, check_needs
 
 #: Weight of both densities in every fusion whose weights are not sought.
 HALF = (0.5, 0.5)
@@ -45,34 +46,23 @@ class Pair:
 
     parts: Mixture
 
-    @property
-    def tracks(self) -> SourceTracks:
-        """The densities as a rule takes them; those of one component as Gaussians."""
-        mean, cov = moments(self.parts)
-        return SourceTracks(mean, cov, mixture=self.parts if self.parts.count > 1 else None)
-
-    def log_mean(self, points: Array, kind: Kind, weights: Sequence[float] = HALF) -> Array:
+    def log_mean(self, points: Array, kind: Kind) -> Array:
         """Logarithm (S,) of the harmonic or geometric mean density, not normalised, at points (S, 2)."""
-        return log_mean_density(log_pdf(self.parts, points[None]), np.asarray(weights, float), kind)
+        return log_mean_density(log_pdf(self.parts, points[None]), np.array(HALF), kind)
 
     def by_rule(self, choice: RuleChoice) -> Row:
         """Fuse by a rule."""
-        rule, tracks = RULES[choice.key], self.tracks
-        return Row(
-            self,
-            lambda rng: rule.fuse(dataclasses.replace(tracks, extras={"seed": rng}), choice.params),
-            rule.uses("seed", choice.params),
-        )
+        return Row(self, lambda rng: choice.fuse(SourceTracks.of(self.parts, seed=rng)), choice.random)
 
     def by_grid(self, kind: Kind, inflation: float = 1.0) -> Row:
         """Take the moments of a mean density by summation; `inflation`: those that samples of wider densities have."""
+        wide = dataclasses.replace(self.parts, cov=inflation * self.parts.cov)
 
-        def density(points: Array) -> Array:
-            wide = dataclasses.replace(self.parts, cov=inflation * self.parts.cov)
-            drawn, meant = (np.logaddexp(*log_pdf(parts, points[None])) for parts in (wide, self.parts))
-            return np.asarray(self.log_mean(points, kind) + drawn - meant)
+        def fuse(rng: np.random.Generator) -> FusedTracks:
+            drawn, meant = (np.logaddexp(*log_pdf(parts, POINTS[None])) for parts in (wide, self.parts))
+            return FusedTracks(*moments_on_grid(self.log_mean(POINTS, kind) + drawn - meant, POINTS))
 
-        return Row(self, lambda rng: FusedTracks(*moments_on_grid(density, POINTS)))
+        return Row(self, fuse)
 
     @cached_property
     def exact(self) -> Array:
@@ -81,10 +71,9 @@ class Pair:
 
     def divergence(self, fused: FusedTracks) -> float:
         """Kullback-Leibler divergence of the exact harmonic mean density from what was fused, in nats."""
-        mixture = fused.mixture or Mixture(np.ones(1), fused.mean[None], fused.cov[None])
-        return kl_on_grid(lambda points: self.exact, lambda points: log_pdf(mixture, points), POINTS)
+        return float(kl_on_grid(self.exact, log_pdf(fused.density, POINTS)))
 
-    def compare(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
+    def compare(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
         """Fuse by any rules: divergence of the exact harmonic mean density from each result, (R,).
 
         Raises
@@ -92,8 +81,8 @@ class Pair:
         ParameterError    a rule needs more than the two densities
         """
         check_needs(rules)
-        samples = sample({f"given-{c.name}": self.by_rule(c) for c in rules}, runs, seed, progress)
-        return {name: values for name, values in samples.items() if name.endswith("/kld_nats")}
+        outcomes = simulate({f"given-{c.name}": self.by_rule(c) for c in rules}, runs, seed, progress)
+        return {name: values for name, values in outcomes.items() if name.endswith("/kld_nats")}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,7 +94,7 @@ class Row:
     random: bool = False
 
 
-def sample(rows: Mapping[str, Row], runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(rows: Mapping[str, Row], runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Fuse by each row whose name starts with `only`; a row that draws nothing, once for all runs.
 
     Returns
@@ -113,18 +102,16 @@ def sample(rows: Mapping[str, Row], runs: Sequence[int], seed: int, progress: Pr
     {row/mean: (R, 2), row/cov: (R, 2, 2), row/kld_nats: (R,)}, and for a mixture of M components row/weight
     (R, M), row/means (R, M, 2), row/covs (R, M, 2, 2)
     """
-    found: Samples = {}
-    rows = chosen(rows, only)
-    for done, (name, row) in enumerate(rows.items()):
-        which = runs if row.random else runs[:1]
-        fused = [row.fuse(stream(seed, run, "samples")) for run in which]
-        for column, values in _columns(row.pair, fused).items():
-            found[f"{name}/{column}"] = values if row.random else np.repeat(values, len(runs), 0)
-        progress((done + 1) / len(rows))
-    return found
+
+    def measure(row: Row) -> Outcomes:
+        each = runs if row.random else runs[:1]
+        columns = _columns(row.pair, [row.fuse(stream(seed, run, "samples")) for run in each])
+        return columns if row.random else {name: np.repeat(values, len(runs), 0) for name, values in columns.items()}
+
+    return row_by_row(chosen(rows, only), progress, measure)
 
 
-def _columns(pair: Pair, fused: Sequence[FusedTracks]) -> Samples:
+def _columns(pair: Pair, fused: Sequence[FusedTracks]) -> Outcomes:
     """Put the results of several runs together."""
     columns = {
         "mean": np.stack([f.mean for f in fused]),
@@ -139,19 +126,19 @@ def _columns(pair: Pair, fused: Sequence[FusedTracks]) -> Samples:
     return columns
 
 
-def figures(rows: Mapping[str, Row], samples: Samples) -> dict[str, Estimate]:
+def figures(rows: Mapping[str, Row], outcomes: Outcomes) -> dict[str, Estimate]:
     """Mean, determinant of the covariance and divergence of every row sampled."""
-    found = {}
+    measured = {}
     for name, row in rows.items():
-        if f"{name}/mean" not in samples:
+        if f"{name}/mean" not in outcomes:
             continue
-        mean, cov = samples[f"{name}/mean"], samples[f"{name}/cov"]
+        mean, cov = outcomes[f"{name}/mean"], outcomes[f"{name}/cov"]
         columns = {
             "determinant_1": np.linalg.det(cov),
             "mean_x_1": mean[:, 0],
             "mean_y_1": mean[:, 1],
-            "kld_nats": samples[f"{name}/kld_nats"],
+            "kld_nats": outcomes[f"{name}/kld_nats"],
         }
         for column, values in columns.items():
-            found[f"{name}/{column}"] = Estimate.mean(values) if row.random else Estimate.exact(values[0])
-    return found
+            measured[f"{name}/{column}"] = Estimate.mean(values) if row.random else Estimate.exact(values[0])
+    return measured

@@ -15,10 +15,13 @@ from track_fusion.rules.ellipsoidal_intersection import EllipsoidalIntersectionP
 from track_fusion.rules.harmonic_mean import HarmonicMeanParams
 from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
 from track_fusion.rules.naive import NaiveParams
+from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import densities as shared
 from track_fusion.scenarios.sharma.densities import COVS, GMD_S, HALF, HMD_GA, HMD_S, SAMPLES, Pair, Row
-from track_fusion.study.chart import Chart, Series, ellipse
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario
+from track_fusion.study.chart import Chart, Series, bars, ellipse, estimates
+from track_fusion.study.rows import Outcomes, Progress
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Claim, Scenario
 
 #: (75)-(76).
 MEANS = np.array([[0.5, 1.0], [2.0, 1.0]])
@@ -70,17 +73,17 @@ ROWS = _rows()
 LEAST_ALPHA = "given-harmonic_mean@grid/least_alpha_1"
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Fuse (75)-(76) by the rows whose names start with `only`; see sharma_densities."""
-    return shared.sample(ROWS, runs, seed, progress, only)
+    return shared.simulate(ROWS, runs, seed, progress, only)
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Moments, determinant and divergence of each row; the least alpha that exceeds the geometric mean."""
-    found = shared.figures(ROWS, samples)
-    if "given-harmonic_mean@grid/mean" in samples:
-        found[LEAST_ALPHA] = Estimate.exact(least_alpha())
-    return found
+    measured = shared.figures(ROWS, outcomes)
+    if "given-harmonic_mean@grid/mean" in outcomes:
+        measured[LEAST_ALPHA] = Estimate.exact(least_alpha())
+    return measured
 
 
 def determinant(alpha: float) -> float:
@@ -95,9 +98,9 @@ def least_alpha() -> float:
     return float(brentq(lambda alpha: determinant(alpha) - wanted, 1.0, 2.0, xtol=1e-6))
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Fig. 1a and 1b, and the determinants behind them."""
-    measured = figures(samples)
+    measured = figures(outcomes)
     sources = tuple(ellipse(f"p{i + 1}", MEANS[i], COVS[i], style="dashed") for i in range(2))
     fused = {
         "GMD = CI": "given-covariance_intersection", "GMD-S": "given-geometric_mean_sampling",
@@ -106,43 +109,35 @@ def charts(samples: Samples) -> list[Chart]:
     }  # fmt: skip
     inflated = {"GMD = CI": fused["GMD = CI"], "HMD-S, alpha 1": fused["HMD-S"]}
     inflated |= {f"HMD-S, alpha {a:g}": f"given-{_inflated(a).name}" for a in ALPHAS}
-    found = [
-        Chart(f"86.5 % regions: {title}", "x", "y", (*sources, *_ellipses(samples, rows)), equal=True)
+    panels = [
+        Chart(f"86.5 % regions: {title}", "x", "y", (*sources, *_ellipses(outcomes, rows)), equal=True)
         for title, rows in (("the fusions (sampling: one run)", fused), ("inflation (one run)", inflated))
-        if any(f"{row}/mean" in samples for row in rows.values())
+        if any(f"{row}/mean" in outcomes for row in rows.values())
     ]
-    found.append(_bars(measured))
-    if LEAST_ALPHA in measured:
-        found.append(_inflation_chart(measured))
-    return found
+    panels.append(_bars(measured))
+    return panels + ([_inflation_chart(measured)] if LEAST_ALPHA in measured else [])
 
 
 def _bars(measured: dict[str, Estimate]) -> Chart:
     """Determinants at equal weights, without inflation."""
-    bars = {
+    values = {
         name.partition("/")[0].removeprefix("given-"): estimate
         for name, estimate in measured.items()
         if name.endswith("/determinant_1") and "alpha" not in name and "own_weights" not in name
     }
-    place = np.arange(len(bars), dtype=float)
-    values = np.array([e.value for e in bars.values()])
-    errors = np.nan_to_num([e.standard_error for e in bars.values()])
-    series = Series("", place, values, "bars", errors)
-    return Chart(
-        "Determinants at weights 1/2", "", "determinant", (series,), ticks=dict(zip(place.tolist(), bars, strict=True))
-    )
+    return bars("Determinants at weights 1/2", "determinant", values)
 
 
-def _ellipses(samples: Samples, rows: dict[str, str]) -> list[Series]:
+def _ellipses(outcomes: Outcomes, rows: dict[str, str]) -> list[Series]:
     return [
         ellipse(
             label,
-            samples[f"{row}/mean"][0],
-            samples[f"{row}/cov"][0],
+            outcomes[f"{row}/mean"][0],
+            outcomes[f"{row}/cov"][0],
             style="dotted" if label in ("GMD-S", "HMD-S") else "line",
         )
         for label, row in rows.items()
-        if f"{row}/mean" in samples
+        if f"{row}/mean" in outcomes
     ]
 
 
@@ -155,9 +150,7 @@ def _inflation_chart(measured: dict[str, Estimate]) -> Chart:
     names = {1.0: "given-harmonic_mean@sampled"} | {a: f"given-{_inflated(a).name}" for a in ALPHAS}
     drawn = {a: measured[f"{n}/determinant_1"] for a, n in names.items() if f"{n}/determinant_1" in measured}
     if drawn:
-        errors = np.nan_to_num([e.standard_error for e in drawn.values()])
-        values = np.array([e.value for e in drawn.values()])
-        lines.append(Series("HMD-S", np.array(list(drawn)), values, "points", errors))
+        lines.append(estimates("HMD-S", drawn))
     return Chart("Inflation of what is sampled", "alpha", "determinant", tuple(lines))
 
 
@@ -168,10 +161,8 @@ def _order(text: str, source: str, *rows: str) -> Claim:
 SCENARIO = Scenario(
     key="sharma-gaussians",
     title="Two Gaussian densities, fused by every rule of the paper",
-    paper="Sharma et al., Harmonic Mean Density Fusion in Distributed Tracking, 5.2, Fig. 1",
+    paper=f"{PAPER}, 5.2, Fig. 1",
     shows="how much each rule claims about the same pair, sampled beside exact, and what inflating the samples does",
-    published={},
-    published_runs=1,
     default_runs=200,
     publication_runs=1000,
     assumptions=(
@@ -184,7 +175,7 @@ SCENARIO = Scenario(
         "divergence: of the exact harmonic mean density from the Gaussian with the fused moments",
         "the relative times of Table 1 are no figures, since times do not repeat: python -m benchmark --only rules",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=(

@@ -6,16 +6,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from track_fusion.densities.mean_density import Kind
+from track_fusion.densities.mixture.mean_density import Kind
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.mixture_geometric import MixtureGeometricParams
+from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import densities as shared
 from track_fusion.scenarios.sharma.densities import COVS, GMD_S, HALF, HMD_GA, HMD_S, Pair
 from track_fusion.study.chart import Chart, Contours
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, Scenario
+from track_fusion.study.rows import Outcomes, Progress
+from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.scenario import Claim, Scenario
 
 #: The two mixtures after (76); the second is printed as another p^1.
 PAIR = Pair(
@@ -41,29 +44,29 @@ X, Y = np.linspace(-6.0, 6.0, 61), np.linspace(-10.0, 7.0, 86)
 LEVELS = (0.05, 0.2, 0.5, 0.8)
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Fuse the mixtures by the rows whose names start with `only`; see sharma_densities."""
-    return shared.sample(ROWS, runs, seed, progress, only)
+    return shared.simulate(ROWS, runs, seed, progress, only)
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Moments, determinant and divergence of each row."""
-    return shared.figures(ROWS, samples)
+    return shared.figures(ROWS, outcomes)
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Fig. 2: the sources, and each mean density exact and by one fusion of samples."""
     plane = np.stack(np.meshgrid(X, Y), -1).reshape(-1, 2)
     sources = tuple(_contours(f"p{i + 1}", log_pdf(PAIR.parts.at(i), plane)) for i in range(2))
-    found = [Chart("Sources", "x", "y", contours=sources, equal=True)]
+    panels = [Chart("Sources", "x", "y", contours=sources, equal=True)]
     kinds: dict[str, tuple[Kind, RuleChoice]] = {"GMD": ("geometric", GMD_S), "HMD": ("harmonic", HMD_S)}
     for title, (kind, choice) in kinds.items():
         row = f"given-{choice.name}"
-        if f"{row}/weight" in samples:
-            drawn = Mixture(*(samples[f"{row}/{column}"][0] for column in ("weight", "means", "covs")))
+        if f"{row}/weight" in outcomes:
+            drawn = Mixture(*(outcomes[f"{row}/{column}"][0] for column in ("weight", "means", "covs")))
             lines = _contours(title, PAIR.log_mean(plane, kind)), _contours(f"{title}-S", log_pdf(drawn, plane))
-            found.append(Chart(f"{title}, exact and by samples (one run)", "x", "y", contours=lines, equal=True))
-    return found
+            panels.append(Chart(f"{title}, exact and by samples (one run)", "x", "y", contours=lines, equal=True))
+    return panels
 
 
 def _contours(label: str, log_density: Array) -> Contours:
@@ -75,10 +78,8 @@ def _contours(label: str, log_density: Array) -> Contours:
 SCENARIO = Scenario(
     key="sharma-mixtures",
     title="Two Gaussian mixtures, fused by sampling",
-    paper="Sharma et al., Harmonic Mean Density Fusion in Distributed Tracking, 5.2, Fig. 2",
+    paper=f"{PAPER}, 5.2, Fig. 2",
     shows="the geometric and the harmonic mean of mixtures, sampled beside exact, and what Gaussian stand-ins lose",
-    published={},
-    published_runs=1,
     default_runs=200,
     publication_runs=1000,
     assumptions=(
@@ -90,7 +91,7 @@ SCENARIO = Scenario(
         "covariance_intersection, harmonic_mean: of the Gaussians with the mixtures' moments",
         "divergence: of the exact harmonic mean density from the fused mixture, or the Gaussian with the moments",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=figures,
     charts=charts,
     claims=(

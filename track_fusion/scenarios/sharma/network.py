@@ -8,19 +8,21 @@ from typing import NamedTuple
 
 import numpy as np
 
+from track_fusion.filters.base import Gaussian
 from track_fusion.linalg import Array, outer
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.metrics.consistency import nees
-from track_fusion.peers.peer import Peer, Round, communicate
+from track_fusion.peers import Peer, Round, communicate
 from track_fusion.random_streams import stream
-from track_fusion.rules import RULES
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
 from track_fusion.rules.ellipsoidal_intersection import EllipsoidalIntersectionParams
 from track_fusion.rules.harmonic_mean import HarmonicMeanParams
 from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
 from track_fusion.rules.naive import NaiveParams
 from track_fusion.study.chart import Chart, Series, ellipse
-from track_fusion.study.scenario import Claim, Progress, RuleChoice, Samples, chosen, compare_each, fuse_runs
+from track_fusion.study.rows import Outcomes, Progress, chosen
+from track_fusion.study.rule_choice import RuleChoice, compare_each, fuse_runs
+from track_fusion.study.scenario import Claim
 
 RULE_CHOICES = (
     RuleChoice("naive", NaiveParams()),
@@ -36,19 +38,15 @@ TRACE_WEIGHTS = (
 )
 
 
-class Tracks(NamedTuple):
-    """One node's estimate in R runs: mean (R, n), cov (R, n, n), or (1, n, n) where all runs have the same."""
-
-    mean: Array
-    cov: Array
-
-
 class Local(NamedTuple):
-    """R runs before anything is sent: state (R, n), estimate of each node, and of one filter that saw all."""
+    """R runs before anything is sent: state (R, n), estimate of each node, and of one filter that saw all.
+
+    Estimates have mean (R, n), cov (R, n, n), or (1, n, n) where all runs have the same.
+    """
 
     state: Array
-    nodes: Mapping[str, Tracks]
-    centralised: Tracks
+    nodes: Mapping[str, Gaussian]
+    centralised: Gaussian
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,20 +64,20 @@ class Network:
     rounds: tuple[Round, ...]
     sink: str
 
-    def fused(self, local: Local, choice: RuleChoice, rngs: Sequence[np.random.Generator] | None = None) -> Tracks:
+    def fused(self, local: Local, choice: RuleChoice, rngs: Sequence[np.random.Generator] | None = None) -> Gaussian:
         """Send estimates through the network, fused by a rule; return the sink's.
 
         A rule that samples draws from each run's generator in `rngs`.
         """
 
-        def fuse(own: Tracks, heard: Tracks, common: Tracks | None, count: int) -> Tracks:
+        def fuse(own: Gaussian, heard: Gaussian, common: Gaussian | None, count: int) -> Gaussian:
             size = max(len(own.cov), len(heard.cov))
             covs = [np.broadcast_to(t.cov, (size, *t.cov.shape[1:])) for t in (own, heard)]
             means = np.stack([own.mean, heard.mean], 1)
-            fused = fuse_runs(RULES[choice.key], choice.params, means, np.stack(covs, 1), rngs)
-            return Tracks(fused.mean, fused.cov)
+            fused = fuse_runs(choice, means, np.stack(covs, 1), rngs)
+            return Gaussian(fused.mean, fused.cov)
 
-        peers = {name: Peer(tracks) for name, tracks in local.nodes.items()}
+        peers = {name: Peer(estimate) for name, estimate in local.nodes.items()}
         for sent in self.rounds:
             peers = communicate(peers, sent, fuse)
         return peers[self.sink].density
@@ -99,9 +97,9 @@ def row_name(row: str, reading: str = "") -> str:
     return f"kf-{row}@{reading}" if reading else f"kf-{row}"
 
 
-def sample(
+def simulate(
     readings: Mapping[str, Network], runs: Sequence[int], seed: int, progress: Progress, only: str = ""
-) -> Samples:
+) -> Outcomes:
     """Run the rows whose names start with `only`, in every reading of the network ("" = as printed).
 
     Returns
@@ -110,46 +108,46 @@ def sample(
     """
     wanted = chosen({row_name(row, reading): (reading, c) for reading in readings for row, c in ROWS.items()}, only)
     local = {reading: readings[reading].estimate(runs, seed) for reading in {r for r, _ in wanted.values()}}
-    found: Samples = {}
+    outcomes: Outcomes = {}
     for done, (name, (reading, choice)) in enumerate(wanted.items()):
         start = local[reading]
         fused = start.centralised if choice is None else readings[reading].fused(start, choice)
-        found[f"{name}/error"] = fused.mean - start.state
-        found[f"{name}/cov"] = np.broadcast_to(fused.cov, (len(runs), *fused.cov.shape[1:]))
+        outcomes[f"{name}/error"] = fused.mean - start.state
+        outcomes[f"{name}/cov"] = np.broadcast_to(fused.cov, (len(runs), *fused.cov.shape[1:]))
         progress((done + 1) / len(wanted))
-    return found
+    return outcomes
 
 
-def figures(samples: Samples) -> dict[str, Estimate]:
+def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     """Trace of the covariance reported and of the errors' own, and NEES over the number of axes."""
-    found = {}
-    for name in _rows(samples):
-        error, cov = samples[f"{name}/error"], samples[f"{name}/cov"]
-        found[f"{name}/reported_trace_1"] = Estimate.mean(np.trace(cov, axis1=1, axis2=2))
-        found[f"{name}/sample_trace_1"] = Estimate.mean((error**2).sum(1))
-        found[f"{name}/nees_1"] = Estimate.mean(nees(error, cov) / error.shape[1])
-    return found
+    estimates = {}
+    for name in _rows(outcomes):
+        error, cov = outcomes[f"{name}/error"], outcomes[f"{name}/cov"]
+        estimates[f"{name}/reported_trace_1"] = Estimate.mean(np.trace(cov, axis1=1, axis2=2))
+        estimates[f"{name}/sample_trace_1"] = Estimate.mean((error**2).sum(1))
+        estimates[f"{name}/nees_1"] = Estimate.mean(nees(error, cov) / error.shape[1])
+    return estimates
 
 
-def _rows(samples: Samples) -> list[str]:
-    return [name.removesuffix("/error") for name in samples if name.endswith("/error")]
+def _rows(outcomes: Outcomes) -> list[str]:
+    return [name.removesuffix("/error") for name in outcomes if name.endswith("/error")]
 
 
-def charts(readings: Mapping[str, str], samples: Samples) -> list[Chart]:
+def charts(readings: Mapping[str, str], outcomes: Outcomes) -> list[Chart]:
     """Figs. 6 and 7: covariances at the sink, reported and of the errors; NEES of all rules.
 
     Parameters
     ----------
     readings : reading -> what to call it in titles
     """
-    found = []
+    panels = []
     for reading, title in readings.items():
         for labels in PICTURES:
-            lines = [line for row in labels for line in _ellipses(samples, row, reading, labels[row])]
+            lines = [line for row in labels for line in _ellipses(outcomes, row, reading, labels[row])]
             if lines:
-                found.append(Chart(f"{title}, 2 sigma", "x", "y", tuple(lines), equal=True))
-    measured = figures(samples)
-    bars = {_label(name): measured[f"{name}/nees_1"] for name in _rows(samples)}
+                panels.append(Chart(f"{title}, 2 sigma", "x", "y", tuple(lines), equal=True))
+    measured = figures(outcomes)
+    bars = {_label(name): measured[f"{name}/nees_1"] for name in _rows(outcomes)}
     place = np.arange(len(bars), dtype=float)
     errors = np.nan_to_num([e.standard_error for e in bars.values()])
     series = (
@@ -157,7 +155,7 @@ def charts(readings: Mapping[str, str], samples: Samples) -> list[Chart]:
         Series("consistent", place[[0, -1]], np.ones(2), "dashed"),
     )
     ticks = dict(zip(place.tolist(), bars, strict=True))
-    return [*found, Chart("Squared errors over the covariance reported", "", "NEES / n", series, ticks=ticks)]
+    return [*panels, Chart("Squared errors over the covariance reported", "", "NEES / n", series, ticks=ticks)]
 
 
 def _label(name: str) -> str:
@@ -166,21 +164,21 @@ def _label(name: str) -> str:
     return {**PICTURES[0], **PICTURES[1]}[row] + at + reading
 
 
-def _ellipses(samples: Samples, row: str, reading: str, label: str) -> list[Series]:
+def _ellipses(outcomes: Outcomes, row: str, reading: str, label: str) -> list[Series]:
     """Ellipses of the covariance that a row reports on average, and of its errors."""
     name = row_name(row, reading)
-    if f"{name}/error" not in samples:
+    if f"{name}/error" not in outcomes:
         return []
-    error = samples[f"{name}/error"]
+    error = outcomes[f"{name}/error"]
     floor = 1e-12 * np.eye(error.shape[1])  # a single run's errors have a singular one
     spread, origin = outer(error).mean(0) + floor, np.zeros(error.shape[1])
-    reported = ellipse(f"{label}, reported", origin, samples[f"{name}/cov"].mean(0))
+    reported = ellipse(f"{label}, reported", origin, outcomes[f"{name}/cov"].mean(0))
     return [reported, ellipse(f"{label}, errors", origin, spread, style="dashed")]
 
 
 def compare(
     network: Network, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress
-) -> Samples:
+) -> Outcomes:
     """Fold by any rules: length of the error at the sink, (R,).
 
     Raises
@@ -189,7 +187,7 @@ def compare(
     """
     local = network.estimate(runs, seed)
 
-    def measure(choice: RuleChoice) -> Samples:
+    def measure(choice: RuleChoice) -> Outcomes:
         rngs = [stream(seed, run, "rule") for run in runs]
         return {"error_1": np.linalg.norm(network.fused(local, choice, rngs).mean - local.state, axis=1)}
 

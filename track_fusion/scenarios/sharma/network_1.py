@@ -7,15 +7,20 @@ from functools import partial
 
 import numpy as np
 
-from track_fusion.filters.kalman import update, update_joint
+from track_fusion.filters.base import Gaussian
+from track_fusion.filters.iterated_corrector import IteratedCorrector
+from track_fusion.filters.kalman import Kalman
 from track_fusion.linalg import Array, matvec
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.peers.peer import Round
+from track_fusion.models.measurement import LinearSensor
+from track_fusion.peers import Round
 from track_fusion.random_streams import stream
+from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import network as shared
-from track_fusion.scenarios.sharma.network import RULE_CHOICES, Local, Network, Tracks, common_claims
+from track_fusion.scenarios.sharma.network import RULE_CHOICES, Local, Network, common_claims
 from track_fusion.study.chart import Chart
-from track_fusion.study.scenario import Claim, Progress, Samples, Scenario
+from track_fusion.study.rows import Outcomes, Progress
+from track_fusion.study.scenario import Claim, Scenario
 
 NODES = 10
 #: The prior of the state, and of every node.
@@ -41,14 +46,16 @@ def estimate(components: int, runs: Sequence[int], seed: int) -> Local:
     """Draw the state, and let every node take in its own measurement of so many components."""
     draws = np.stack([stream(seed, run, "network").standard_normal((1 + NODES, 2)) for run in runs])
     state = MEAN + np.sqrt(VARIANCE) * draws[:, 0]
-    mean, cov = np.broadcast_to(MEAN, state.shape), VARIANCE * np.eye(2)[None]
-    matrices, noise = [matrix(i, components) for i in range(1, NODES + 1)], NOISE * np.eye(components)
-    zs = [matvec(h, state) + np.sqrt(NOISE) * draws[:, i + 1, :components] for i, h in enumerate(matrices)]
-    nodes = {
-        f"S{i + 1}": Tracks(*update(mean, cov, z, h, noise)[:2])
-        for i, (z, h) in enumerate(zip(zs, matrices, strict=True))
+    axes, noise = ("first", "second")[:components], NOISE * np.eye(components)
+    sensors = {f"S{i}": LinearSensor(axes, matrix(i, components), noise) for i in range(1, NODES + 1)}
+    zs = {
+        name: matvec(sensor.matrix, state) + np.sqrt(NOISE) * draws[:, i, :components]
+        for i, (name, sensor) in enumerate(sensors.items(), 1)
     }
-    return Local(state, nodes, Tracks(*update_joint(mean, cov, zs, matrices, [noise] * NODES)[:2]))
+    prior, one = Gaussian(np.broadcast_to(MEAN, state.shape), VARIANCE * np.eye(2)[None]), Kalman()
+    nodes = {name: one.update(prior, zs[name], sensor)[0] for name, sensor in sensors.items()}
+    centralised, _ = IteratedCorrector(one).update(prior, list(zs.values()), list(sensors.values()))
+    return Local(state, nodes, centralised)
 
 
 READINGS = {
@@ -57,14 +64,14 @@ READINGS = {
 }
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Run the rows whose names start with `only`: errors and covariances at S10."""
-    return shared.sample(READINGS, runs, seed, progress, only)
+    return shared.simulate(READINGS, runs, seed, progress, only)
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Fig. 6 for both readings of the measurements."""
-    return shared.charts({"": "S10, (82) as printed", "one_row": "S10, one component each"}, samples)
+    return shared.charts({"": "S10, (82) as printed", "one_row": "S10, one component each"}, outcomes)
 
 
 def _bloated(text: str, reading: str) -> Claim:
@@ -79,9 +86,8 @@ def _bloated(text: str, reading: str) -> Claim:
 SCENARIO = Scenario(
     key="sharma-network-1",
     title="Ten nodes in a network, one measurement each",
-    paper="Sharma et al., Harmonic Mean Density Fusion in Distributed Tracking, 6.2, Figs. 4 and 6",
+    paper=f"{PAPER}, 6.2, Figs. 4 and 6",
     shows="what each rule reports and how large its errors are where the same news comes by several ways",
-    published={},
     published_runs=50_000,
     default_runs=20_000,
     publication_runs=50_000,
@@ -95,7 +101,7 @@ SCENARIO = Scenario(
         "each node measures the first row of (82) alone",
         "heavily bloated: the trace reported is at least 1.5 times that of the errors",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=shared.figures,
     charts=charts,
     claims=(

@@ -7,14 +7,21 @@ from functools import partial
 
 import numpy as np
 
-from track_fusion.filters.kalman import predict, update, update_joint
-from track_fusion.linalg import matvec
+from track_fusion.filters.base import Gaussian
+from track_fusion.filters.iterated_corrector import IteratedCorrector
+from track_fusion.filters.kalman import Kalman
+from track_fusion.linalg import Array, matvec
 from track_fusion.metrics.accuracy import Estimate
+from track_fusion.models.base import Transition
+from track_fusion.models.measurement import LinearSensor
 from track_fusion.random_streams import stream
+from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import network as shared
-from track_fusion.scenarios.sharma.network import RULE_CHOICES, Local, Network, Tracks, common_claims
+from track_fusion.scenarios.sharma.network import RULE_CHOICES, Local, Network, common_claims
 from track_fusion.study.chart import Chart
-from track_fusion.study.scenario import Claim, Progress, Samples, Scenario
+from track_fusion.study.rows import Outcomes, Progress
+from track_fusion.study.scenario import Claim, Scenario
+from track_fusion.trackers.fusion_loop import filtered
 
 STEPS, NODES = 5, 5
 #: The prior of the state, and of every node.
@@ -23,7 +30,7 @@ MEAN, COV = np.array([0.0, 1.0]), np.array([[2.0, 1.0], [1.0, 2.0]])
 TRANSITION, PROCESS_NOISE = np.array([[1.0, 0.5], [0.0, 1.0]]), 0.5 * np.eye(2)
 #: (84): of S1, S3, S5, and of S2, S4.
 ODD, EVEN = np.diag([0.5, 0.2]), np.diag([0.1, 0.5])
-NOISES = (ODD, EVEN, ODD, EVEN, ODD)
+SENSORS = [LinearSensor(("first", "second"), np.eye(2), noise) for noise in (ODD, EVEN, ODD, EVEN, ODD)]
 #: How near "almost equal" is.
 ALMOST = 1.25
 
@@ -32,29 +39,31 @@ def estimate(runs: Sequence[int], seed: int) -> Local:
     """Draw the state and let every node track it by a Kalman filter; one filter takes in all measurements."""
     draws = np.stack([stream(seed, run, "network").standard_normal((1 + STEPS * (1 + NODES), 2)) for run in runs])
     state = MEAN + matvec(np.linalg.cholesky(COV), draws[:, 0])
-    start = np.broadcast_to(MEAN, state.shape), COV[None]
-    nodes, centralised, h = [start] * NODES, start, np.eye(2)
+    seen: list[list[Array]] = []
     for step in range(STEPS):
         fresh = draws[:, 1 + step * (1 + NODES) :]
         state = matvec(TRANSITION, state) + matvec(np.sqrt(PROCESS_NOISE), fresh[:, 0])
-        zs = [state + matvec(np.sqrt(noise), fresh[:, 1 + i]) for i, noise in enumerate(NOISES)]
-        moved = [predict(*track, TRANSITION, PROCESS_NOISE) for track in nodes]
-        nodes = [update(*track, z, h, noise)[:2] for track, z, noise in zip(moved, zs, NOISES, strict=True)]
-        centralised = update_joint(*predict(*centralised, TRANSITION, PROCESS_NOISE), zs, [h] * NODES, NOISES)[:2]
-    return Local(state, {f"S{i + 1}": Tracks(*track) for i, track in enumerate(nodes)}, Tracks(*centralised))
+        seen.append([state + matvec(np.sqrt(sensor.noise), fresh[:, 1 + i]) for i, sensor in enumerate(SENSORS)])
+    one, motion = Kalman(), Transition.linear(TRANSITION, PROCESS_NOISE)
+    start = Gaussian(np.broadcast_to(MEAN, state.shape), COV[None])
+    nodes = {}
+    for i, sensor in enumerate(SENSORS):
+        *_, nodes[f"S{i + 1}"] = filtered(one, start, motion, [zs[i] for zs in seen], sensor)
+    *_, centralised = filtered(IteratedCorrector(one), start, motion, seen, SENSORS)
+    return Local(state, nodes, centralised)
 
 
 READINGS = {"": Network(estimate, ([(f"S{i}", "S5") for i in range(1, NODES)],), "S5")}
 
 
-def sample(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Samples:
+def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
     """Run the rows whose names start with `only`: errors and covariances at S5."""
-    return shared.sample(READINGS, runs, seed, progress, only)
+    return shared.simulate(READINGS, runs, seed, progress, only)
 
 
-def charts(samples: Samples) -> list[Chart]:
+def charts(outcomes: Outcomes) -> list[Chart]:
     """Fig. 7."""
-    return shared.charts({"": "S5"}, samples)
+    return shared.charts({"": "S5"}, outcomes)
 
 
 def _almost(central: Estimate, harmonic: Estimate) -> bool:
@@ -64,9 +73,8 @@ def _almost(central: Estimate, harmonic: Estimate) -> bool:
 SCENARIO = Scenario(
     key="sharma-network-2",
     title="Five nodes track for five steps, then fuse at one",
-    paper="Sharma et al., Harmonic Mean Density Fusion in Distributed Tracking, 6.3, Figs. 5 and 7",
+    paper=f"{PAPER}, 6.3, Figs. 5 and 7",
     shows="what each rule reports and how large its errors are where tracks share process noise and a prior",
-    published={},
     published_runs=50_000,
     default_runs=20_000,
     publication_runs=50_000,
@@ -80,7 +88,7 @@ SCENARIO = Scenario(
         "errors average; at a weight of 0 or 1 the news of S1 would be lost",
         "almost equal: the trace is at most 1.25 times the other",
     ),
-    sample=sample,
+    simulate=simulate,
     figures=shared.figures,
     charts=charts,
     claims=(

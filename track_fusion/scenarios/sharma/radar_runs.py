@@ -9,11 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.association.assignment import nearest_pairs
 from track_fusion.centre.centre import FusionCentre
 from track_fusion.centre.config import CentreConfig, FusionCentreParams, SourceConfig, TrackManagerParams
 from track_fusion.linalg import Array
-from track_fusion.metrics.consistency import nees
+from track_fusion.metrics.pairing import paired
 from track_fusion.models.geodetic import LocalFrame
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
@@ -23,7 +22,8 @@ from track_fusion.rules.harmonic_mean import HarmonicMeanParams
 from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
 from track_fusion.rules.naive import NaiveParams
 from track_fusion.scenarios.sharma.surveillance import Courses, Radar, Surveillance
-from track_fusion.study.scenario import Progress, RuleChoice, Samples
+from track_fusion.study.rows import Outcomes, Progress
+from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.trackers.many_targets import PdaTracker, PdaTrackerParams
 from track_fusion.tracks import SECOND_NS, TrackBatch, planar_layout
 
@@ -114,7 +114,7 @@ def scene() -> Surveillance:
 @cache
 def seen() -> NDArray[np.bool_]:
     """Tell at each scan, the start included, which radar sees which target, (STEPS + 1, radars, 20)."""
-    return np.stack([radar.sees(scene().truth(0, 0)) for radar in scene().radars.values()], 1)
+    return np.stack([radar.sees(scene().states(0, 0)) for radar in scene().radars.values()], 1)
 
 
 def seen_by() -> NDArray[np.intp]:
@@ -173,15 +173,13 @@ class Judged(NamedTuple):
 def judged(tracks: TrackBatch, truth: Array) -> Judged:
     """Pair tracks and targets, truth (N, n), one to one by least total distance, within REACH_M."""
     mean, cov = tracks.moments
-    at = list(LAYOUT.position)
-    target, track = nearest_pairs(truth[:, at], mean[:, at], REACH_M)
-    count = len(truth)
-    found = Judged(np.full((count, 2), np.nan), np.full(count, np.nan), np.full(count, np.nan),
-                   np.array(float(len(mean) - len(track))))  # fmt: skip
-    found.position[target] = mean[track][:, at]
-    found.nees[target] = nees(mean[track] - truth[target], cov[track])
-    found.variance[target] = cov[track][:, at, at].sum(-1)
-    return found
+    pairs, at, lost = paired(LAYOUT, truth, mean, cov, REACH_M), list(LAYOUT.position), np.full(len(truth), np.nan)
+    false = np.array(float(len(mean) - len(pairs.track)))
+    position, score, variance = np.full((len(truth), 2), np.nan), lost.copy(), lost
+    position[pairs.target] = mean[pairs.track][:, at]
+    score[pairs.target] = pairs.nees
+    variance[pairs.target] = cov[pairs.track][:, at, at].sum(-1)
+    return Judged(position, score, variance, false)
 
 
 def judged_alone(scans: Mapping[int, TrackBatch], truth: Array) -> Judged:
@@ -192,8 +190,8 @@ def judged_alone(scans: Mapping[int, TrackBatch], truth: Array) -> Judged:
     return Judged(position, score, variance, parts[-1].mean())
 
 
-def tracked(rows: Mapping[str, RuleChoice | None], runs: Sequence[int], seed: int, progress: Progress) -> Samples:
-    """Run rules, and the radars alone (None), on the same tracks of the radars; see :func:`sample`."""
+def tracked(rows: Mapping[str, RuleChoice | None], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
+    """Run rules, and the radars alone (None), on the same tracks of the radars; see :func:`simulate`."""
     each = [
         _one_run(rows, seed, run, lambda share, done=done: progress((done + share) / len(runs)))  # type: ignore[misc]
         for done, run in enumerate(runs)
@@ -203,7 +201,7 @@ def tracked(rows: Mapping[str, RuleChoice | None], runs: Sequence[int], seed: in
 
 def _one_run(rows: Mapping[str, RuleChoice | None], seed: int, run: int, progress: Progress) -> dict[str, Array]:
     """Run one Monte Carlo run: {row/column: (F, ...)}."""
-    truth = scene().truth(seed, run)[FUSION_SCANS::FUSION_SCANS]
+    truth = scene().states(seed, run)[FUSION_SCANS::FUSION_SCANS]
     centres = {row: centre(choice) for row, choice in rows.items() if choice is not None}
     steps: dict[str, list[Judged]] = {row: [] for row in rows}
     for states, (time_ns, scans) in zip(truth, local_tracks(seed, run, progress), strict=True):
@@ -218,8 +216,8 @@ def _columns(row: str, kept: Sequence[Judged]) -> dict[str, Array]:
     return {f"{row}/{c}": np.stack(values) for c, values in zip(COLUMNS, zip(*kept, strict=True), strict=True)}
 
 
-def judge(row: str, published: Sequence[TrackBatch]) -> Samples:
+def judge(row: str, published: Sequence[TrackBatch]) -> Outcomes:
     """Judge what a centre published at each fusion, as one run of a row of :func:`tracked`."""
-    truth = scene().truth(0, 0)[FUSION_SCANS::FUSION_SCANS]
+    truth = scene().states(0, 0)[FUSION_SCANS::FUSION_SCANS]
     kept = [judged(tracks.to_axes(LAYOUT), states) for tracks, states in zip(published, truth, strict=True)]
     return {name: part[None] for name, part in _columns(row, kept).items()}

@@ -113,14 +113,14 @@ class Surveillance:
         """Sensors by name."""
         return {name: radar.sensor for name, radar in self.radars.items()}
 
-    def truth(self, seed: int, run: int, steps: int | None = None) -> Array:
+    def states(self, seed: int, run: int, steps: int | None = None) -> Array:
         """Return the states at steps 0 to T, (T + 1, N, n), the same whatever the seed and the run."""
         count = (self.steps if steps is None else steps) + 1
         return self.courses.states(self.layout, self.dt_s * np.arange(count, dtype=np.float64))
 
     def scans(self, seed: int, run: int, steps: int | None = None) -> Iterator[dict[str, Array]]:
         """Draw scan after scan, of all radars: (D_k, 2) each."""
-        truth = self.truth(seed, run, steps)[1:]
+        truth = self.states(seed, run, steps)[1:]
         each = [radar.scans(truth, stream(seed, run, name)) for name, radar in self.radars.items()]
         return (dict(zip(self.radars, scan, strict=True)) for scan in zip(*each, strict=True))
 

@@ -1,7 +1,9 @@
-"""Make the golden bags and the fused tracks expected from them: python test/data/make_golden.py [directory].
+"""Make the golden bags and the fused tracks expected from them.
 
-This is an oracle. It shares no code with the package: it follows doc/fusion-centre.md with plain loops, assigns by
-trying every assignment, and fuses by plain matrix algebra. It writes into the directory (else test/data/golden)
+    PYTHONPATH=test python -m oracles.make_golden [directory, else test/data/golden]
+
+This is an oracle. It shares no code with the package: the scene is drawn and tracked here by plain loops, and fused by
+oracles/fusion_centre.py. It writes
 
     tracks/, odometry/       rosbag2 directories (mcap): the same tracks as track tables and as nav_msgs/Odometry
     expected_<rule>.json     the fused tables expected from tracks/ with state_fusion = <rule>
@@ -11,20 +13,29 @@ The scene: targets A and B cross; C is born, B dies; tracker 2 loses two scans i
 first scans, at 1000 s, are empty; Odometry cannot carry an empty scan, so that bag begins a step later.
 """
 
-import itertools
 import json
 import math
 import shutil
 import struct
 import sys
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
+from oracles.fusion_centre import (
+    COASTED,
+    CONFIRMED,
+    Settings,
+    arithmetic_average,
+    covariance_intersection,
+    motion,
+    naive,
+    predict,
+    run_centre,
+)
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
-from scipy.stats import chi2
 
+GOLDEN = Path(__file__).parents[1] / "data" / "golden"
 SEED = 66
 START_NS, PERIOD_NS, STEPS = 1000 * 10**9, 10**8, 60
 LOST = (28, 29)  # steps at which sensor_2 publishes nothing
@@ -38,6 +49,7 @@ PARAMETERS = {
     "publish_tentative": False, "fuse_confirmed_only": True, "fuse_coasted": True,
     "covariance_intersection.criterion": "det", "arithmetic_average.criterion": "uniform",
 }  # fmt: skip
+SETTINGS = Settings(**{k: v for k, v in PARAMETERS.items() if k in Settings.__dataclass_fields__})
 AXES = PARAMETERS["layout"]
 START_STATE = {"A": [20.0, 42.0, 8.0, 1.0], "B": [20.0, 48.0, 8.0, -1.0], "C": [95.0, 25.0, -4.0, 5.0]}
 # Each tracker is sharp in a direction of its own, so that covariance intersection has to weigh them.
@@ -47,22 +59,7 @@ SENSORS = {
     "sensor_2": {"sigmas": (0.9, 2.5), "angle": 1.9, "ids": {"C": 209, "B": 203, "A": 205}, "first_of_c": 37},
 }
 FUSED_ID = {"A": 1, "B": 2, "C": 3}
-FRAME, CONFIRMED, COASTED = "map", 1, 2
-MEMORY = False  # of the centre; test_fusion_centre.py turns it on, the golden bags are made without
-
-
-def motion(dt):
-    """F and Q of nearly constant velocity with a piecewise constant acceleration, for the axes x y vx vy."""
-    both_axes, s = np.eye(2), PARAMETERS["process_noise"]
-    f = np.kron([[1, dt], [0, 1]], both_axes)
-    return f, np.kron(s**2 * np.array([[dt**4 / 4, dt**3 / 2], [dt**3 / 2, dt**2]]), both_axes)
-
-
-def predict(mean, cov, from_ns, to_ns):
-    if from_ns == to_ns:
-        return mean, cov
-    f, q = motion((to_ns - from_ns) / 1e9)
-    return f @ mean, f @ cov @ f.T + q
+FRAME = "map"
 
 
 # ---- the scene and the two trackers ------------------------------------------------------------------------------
@@ -71,13 +68,14 @@ def predict(mean, cov, from_ns, to_ns):
 def make_truth(rng):
     """{target: {step: state}}, each with random accelerations constant over a step."""
     dt, truth = PERIOD_NS / 1e9, {}
+    transition, _ = motion(dt, SETTINGS.process_noise)
     for target, start in START_STATE.items():
         first, last = (36, STEPS) if target == "C" else (1, DEATH if target == "B" else STEPS)
         state, truth[target] = np.array(start), {}
         for step in range(first, last):
             truth[target][step] = state
-            acceleration = PARAMETERS["process_noise"] * rng.standard_normal(2)
-            state = motion(dt)[0] @ state + np.concatenate([acceleration * dt**2 / 2, acceleration * dt])
+            acceleration = SETTINGS.process_noise * rng.standard_normal(2)
+            state = transition @ state + np.concatenate([acceleration * dt**2 / 2, acceleration * dt])
     return truth
 
 
@@ -97,7 +95,7 @@ def run_tracker(rng, truth, sensor):
                 mean, cov = np.concatenate([z, [0.0, 0.0]]), np.diag([0.0, 0.0, 100.0, 100.0])
                 cov[:2, :2] = noise
             else:
-                mean, cov = predict(*filters[target], 0, PERIOD_NS)
+                mean, cov = predict(*filters[target], 0, PERIOD_NS, SETTINGS.process_noise)
                 gain = cov @ h.T @ np.linalg.inv(h @ cov @ h.T + noise)
                 joseph = np.eye(4) - gain @ h
                 mean, cov = mean + gain @ (z - h @ mean), joseph @ cov @ joseph.T + gain @ noise @ gain.T
@@ -185,165 +183,6 @@ def check_bag(directory, scans):
     assert not any(waiting.values())
 
 
-# ---- the rules: members [(mean, cov)] to (mean, cov) -------------------------------------------------------------
-
-
-def naive(members):
-    cov = np.linalg.inv(sum(np.linalg.inv(p) for _, p in members))
-    return cov @ sum(np.linalg.inv(p) @ m for m, p in members), cov
-
-
-def arithmetic_average(members):
-    mean = sum(m for m, _ in members) / len(members)
-    return mean, sum(p + np.outer(m - mean, m - mean) for m, p in members) / len(members)
-
-
-def determinant_polynomial(p, q):
-    """Exact coefficients in w of det(p + w (q - p)): a sum over permutations (Leibniz)."""
-    n, total = len(p), [Fraction(0)] * (len(p) + 1)
-    for permutation in itertools.permutations(range(n)):
-        inversions = sum(permutation[i] > permutation[j] for i in range(n) for j in range(i + 1, n))
-        product = [Fraction((-1) ** inversions)]
-        for i, j in enumerate(permutation):
-            constant, slope = Fraction(p[i, j]), Fraction(q[i, j]) - Fraction(p[i, j])
-            product = [a * constant + b * slope for a, b in zip([*product, 0], [0, *product], strict=True)]
-        total = [a + b for a, b in zip(total, product, strict=True)]
-    return total
-
-
-def intersection_weight(p1, p2):
-    """The w in [0, 1] that makes det of (w P1^-1 + (1-w) P2^-1)^-1 least, to 2^-70, in exact arithmetic.
-
-    w P1^-1 + (1-w) P2^-1 = P1^-1 (w P2 + (1-w) P1) P2^-1, so det(P1 + w (P2 - P1)) is to be greatest. It is a
-    polynomial whose logarithm is concave, so its slope changes sign at most once.
-    """
-    coefficients = determinant_polynomial(p1, p2)
-
-    def slope(w):
-        return sum(k * c * w ** (k - 1) for k, c in enumerate(coefficients) if k)
-
-    low, high = Fraction(0), Fraction(1)
-    if slope(low) <= 0 or slope(high) >= 0:
-        return 0.0 if slope(low) <= 0 else 1.0
-    for _ in range(70):
-        middle = (low + high) / 2
-        low, high = (middle, high) if slope(middle) > 0 else (low, middle)
-    return float(low)
-
-
-def covariance_intersection(members):
-    (m1, p1), (m2, p2) = members
-    w = intersection_weight(p1, p2)
-    i1, i2 = w * np.linalg.inv(p1), (1 - w) * np.linalg.inv(p2)
-    cov = np.linalg.inv(i1 + i2)
-    return cov @ (i1 @ m1 + i2 @ m2), cov
-
-
-# ---- the fusion centre, by doc/fusion-centre.md ------------------------------------------------------------------
-
-
-def associate(rows, tracks, margins):
-    """Step 3. {index of row: index of track}, the candidates {(row, track): d2}; margins collects how close it was."""
-    gamma = float(chi2.ppf(PARAMETERS["gate_probability"], len(AXES)))
-    d2, log_det = {}, {}
-    for i, row in enumerate(rows):
-        for j, track in enumerate(tracks):
-            s, r = row["cov"] + track["cov"], row["mean"] - track["mean"]
-            distance = float(r @ np.linalg.inv(s) @ r)
-            margins["gate"].append(abs(distance - gamma))
-            if distance <= gamma:
-                d2[i, j], log_det[i, j] = distance, math.log(np.linalg.det(s))
-    miss = {}  # of each row that has a candidate
-    for i in {i for i, _ in d2}:
-        component = {pair for pair in d2 if pair[0] == i}
-        for _ in d2:  # often enough to reach all that is connected
-            component = {p for p in d2 if any(p[0] == q[0] or p[1] == q[1] for q in component)}
-        miss[i] = gamma + max(log_det[pair] for pair in component)
-    found, choices = [], [[None, *(j for j in range(len(tracks)) if (i, j) in d2)] for i in range(len(rows))]
-    for choice in itertools.product(*choices):
-        taken = [j for j in choice if j is not None]
-        if len(taken) == len(set(taken)):
-            costs = [miss.get(i, 0.0) if j is None else d2[i, j] + log_det[i, j] for i, j in enumerate(choice)]
-            found.append((sum(costs), choice))
-    found.sort(key=lambda item: item[0])
-    margins["assignment"] += [second[0] - found[0][0] for second in found[1:2]]
-    return {i: j for i, j in enumerate(found[0][1]) if j is not None}, d2
-
-
-def run_centre(scans, rule):
-    """The expected steps, and a log of them for the checks."""
-    sources, central, next_id = PARAMETERS["sources"], [], 1
-    used, steps, log, margins, last_ns = set(), [], [], {"gate": [], "assignment": []}, None
-    for t in sorted({stamp_ns for source in sources for stamp_ns, _ in scans[source]}):
-        # 1, 2: the newest scan of each source, unless too old; everything predicted to t.
-        parts, new = {}, set()
-        for source in sources:
-            past = [scan for scan in scans[source] if scan[0] <= t]
-            if not past or (t - past[-1][0]) / 1e9 > PARAMETERS["max_scan_age_s"]:
-                continue
-            stamp_ns, parts[source] = past[-1][0], []
-            if (source, stamp_ns) not in used:
-                new.add(source)
-            elif MEMORY:
-                del parts[source]
-                continue
-            used.add((source, stamp_ns))
-            for row in past[-1][1]:
-                mean, cov = predict(row["mean"], row["cov"], stamp_ns, t)
-                parts[source].append({"track_id": row["track_id"], "mean": mean, "cov": cov, "stamp_ns": stamp_ns})
-        for track in central:
-            track["mean"], track["cov"] = predict(track["mean"], track["cov"], last_ns, t)
-            track["members"] = {}
-        # 3: each source by itself with the central tracks; 4: what is left, with the groups of earlier sources.
-        older, candidates = list(central), []
-        for source, rows in parts.items():
-            pairs, d2 = associate(rows, older, margins)
-            candidates += [(source, rows[i]["track_id"], older[j]["track_id"]) for i, j in d2]
-            for i, j in pairs.items():
-                older[j]["members"][source] = rows[i]
-            left = [row for i, row in enumerate(rows) if i not in pairs and source in new]
-            groups = central[len(older) :]
-            pairs, _ = associate(left, groups, margins)
-            for i, row in enumerate(left):
-                if i in pairs:
-                    groups[pairs[i]]["members"][source] = row
-                    continue
-                group = {"track_id": next_id, "mean": row["mean"], "cov": row["cov"], "members": {source: row}}
-                central.append(group | {"updates": {s: [] for s in sources}, "confirmed": False})
-                next_id += 1
-        # 5: fuse; 6: count; 7: confirm and delete.
-        kept = []
-        for track in central:
-            members = [(m["mean"], m["cov"]) for m in (track["members"].get(s) for s in sources) if m]
-            if members:
-                if MEMORY and any(track is one for one in older):
-                    members.insert(0, (track["mean"], track["cov"]))
-                track["mean"], track["cov"] = rule(members) if len(members) > 1 else members[0]
-                track["last_member_ns"] = max(m["stamp_ns"] for m in track["members"].values())
-            for source in new:
-                track["updates"][source].append(source in track["members"])
-            m, n = PARAMETERS["confirmation_threshold"]
-            track["confirmed"] |= any(sum(u[-n:]) >= m for u in track["updates"].values())
-            p, q = PARAMETERS["deletion_threshold"]
-            worn_out = all(u[-q:].count(False) >= p for u in track["updates"].values() if any(u))
-            overdue = (t - track["last_member_ns"]) / 1e9 > PARAMETERS["max_coast_s"]
-            if track["members"] or not (worn_out or overdue):
-                kept.append(track)
-        central = kept
-        # 8: publish.
-        table = []
-        for track in central:
-            if track["confirmed"]:
-                bits = sum(2**k for k, source in enumerate(sources) if source in track["members"])
-                row = {"track_id": track["track_id"], "source": bits, "status": CONFIRMED + (0 if bits else COASTED)}
-                table.append(row | {"mean": track["mean"].tolist(), "cov": track["cov"].tolist()})
-        steps.append({"stamp_ns": t, "tracks": table})
-        members = {(s, m["track_id"]): track["track_id"] for track in central for s, m in track["members"].items()}
-        log.append({"members": members, "candidates": candidates})
-        last_ns = t
-    return steps, log, margins
-
-
 # ---- what the scene must have in it ------------------------------------------------------------------------------
 
 
@@ -376,8 +215,7 @@ def check(name, steps, log, margins, truth):
     print(f"{name}: {len(steps)} steps, {close} of them crossing in each other's gate, least margins {least}")
 
 
-def main():
-    directory = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent / "golden"
+def main(directory):
     rng = np.random.default_rng(SEED)
     truth = make_truth(rng)
     scans = {source: run_tracker(rng, truth, sensor) for source, sensor in SENSORS.items()}
@@ -395,7 +233,7 @@ def main():
     }
     jobs = [("tracks", rule.__name__, rule, scans) for rule in (covariance_intersection, naive, arithmetic_average)]
     for bag, name, rule, tracks in [*jobs, ("odometry", "odometry", covariance_intersection, blocks)]:
-        steps, log, margins = run_centre(tracks, rule)
+        steps, log, margins = run_centre(tracks, rule, SETTINGS)
         check(name, steps, log, margins, truth)
         head = {"bag": bag, "frame_id": FRAME, "parameters": PARAMETERS | {"state_fusion": rule.__name__}}
         lines = ",\n".join(json.dumps(step, separators=(",", ":")) for step in steps)
@@ -403,4 +241,4 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else GOLDEN)

@@ -6,9 +6,9 @@ from typing import Any
 
 import mpmath
 import numpy as np
+from numpy.typing import NDArray
 
-from track_fusion.linalg import Array
-
+Array = NDArray[np.float64]
 mp = mpmath.mp.clone() if hasattr(mpmath.mp, "clone") else mpmath.MPContext()
 mp.dps = 40
 GOLDEN = (mp.sqrt(5) - 1) / 2

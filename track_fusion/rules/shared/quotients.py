@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.densities.mixture.mixture import Mixture
+from track_fusion.densities.log_domain import log_sum_exp
+from track_fusion.densities.mixture.algebra import LogMixture, product
+from track_fusion.densities.mixture.mixture import Mixture, chosen
 from track_fusion.densities.mixture.proposals import (
     Pruned,
     direct_local_sampling,
@@ -21,18 +23,14 @@ from track_fusion.densities.mixture.quotient import Laplace
 from track_fusion.linalg import Array
 from track_fusion.params import param
 from track_fusion.rules.base import SourceTracks
-from track_fusion.rules.mixture_common import ReductionParams
+from track_fusion.rules.shared.folding import DIAGNOSTICS, Step
+from track_fusion.rules.shared.mixtures import ReductionParams
 
 
 @dataclasses.dataclass(frozen=True)
 class QuotientParams(ReductionParams):
     """How a quotient of mixtures becomes a mixture, and from how many samples."""
 
-    method: str = param(
-        "dls",
-        "dls: sample each mixand, igs: sample the whole and share out, naive_bayes: the plain product",
-        choices=("dls", "igs", "naive_bayes"),
-    )
     proposal: str = param(
         "heavy_tail",
         "what dls samples from: the naive mean with a component's covariance (ingis), Laplace's approximation (lagis), "
@@ -84,8 +82,41 @@ def sample_mixands(
     if params.proposal == "ingis":
         proposal = inflated_naive(kept.quotient, first, second, params.default_variance, kept.order)
     else:
-        found = approximate()
-        proposal = laplace_proposals(found) if params.proposal == "lagis" else heavy_tail(found, wide(found))
+        near = approximate()
+        proposal = laplace_proposals(near) if params.proposal == "lagis" else heavy_tail(near, wide(near))
     local = direct_local_sampling(kept.quotient, proposal, rng, params.mixand_samples)
     ess = (local.mixture.weight * local.ess).sum(-1) / params.mixand_samples
     return local.mixture, {"ess": ess, "log_eta": local.log_eta, "pruned": kept.share}
+
+
+def multiply(first: Mixture, second: Mixture) -> Step:
+    """Fuse naively, with nothing divided out: nothing is sought or sampled."""
+    whole = product(LogMixture.of(first), LogMixture.of(second))
+    return Step(whole.normalised, None, {"log_eta": log_sum_exp(whole.log_weight)})
+
+
+def either(take: NDArray[np.bool_], one: Step, other: Step) -> Step:
+    """Take, where `take` (...), the step `one`, else `other`; both have a weight of the first, or neither has."""
+    omega = None if one.omega is None or other.omega is None else np.where(take, one.omega, other.omega)
+    info = {
+        name: np.where(take, *(step.info.get(name, DIAGNOSTICS[name][1]) for step in (one, other)))
+        for name in {**one.info, **other.info}
+    }
+    return Step(chosen(take, one.mixture, other.mixture), omega, info)
+
+
+def closed_form_where(single: NDArray[np.bool_], closed: Callable[[], Step], sampled: Callable[[], Step]) -> Step:
+    """Fuse in closed form where every mixture has one component, `single` (...), by sampling elsewhere."""
+    if single.all():
+        return closed()
+    return either(single, closed(), sampled()) if single.any() else sampled()
+
+
+def has_one_component(mixture: Mixture) -> NDArray[np.bool_]:
+    """Tell which mixtures (...) are Gaussian: the other components, if any, have no weight."""
+    return np.asarray((mixture.weight > 0.0).sum(-1) == 1)
+
+
+def heaviest(mixture: Mixture) -> Mixture:
+    """Return the heaviest component (..., 1) of each mixture (..., C)."""
+    return mixture.take(mixture.weight.argmax(-1)[..., None])

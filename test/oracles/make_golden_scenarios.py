@@ -1,8 +1,9 @@
-"""Make the golden bags of two scenarios and the fused tracks expected: python test/data/make_golden_scenarios.py.
+"""Make the golden bags of two scenarios and the fused tracks expected from them.
 
-This is an oracle, as make_golden.py: it shares no code with the package. It writes into the directory given (else
-test/data/golden), for each of the scenes "turn" (li2022-nonlinear, range and bearing) and "line" (li2022-linear,
-positions)
+    PYTHONPATH=test python -m oracles.make_golden_scenarios [directory, else test/data/golden]
+
+This is an oracle, as make_golden.py: it shares no code with the package. It writes, for each of
+the scenes "turn" (li2022-nonlinear, range and bearing) and "line" (li2022-linear, positions)
 
     <scene>/                        a rosbag2 directory (mcap) of detections of two sensors
     expected_<scene>_<rule>.json    the fused tables expected with state_fusion = <rule>
@@ -21,7 +22,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from make_golden import covariance_intersection, header, msg, naive, write_bag
+from oracles.fusion_centre import covariance_intersection, naive
+from oracles.make_golden import GOLDEN, header, msg, write_bag
 
 STEPS, SECOND_NS = 60, 10**9
 MISSED, DOUBLED, TURNED = (20, 21), 33, 40  # steps: of sensor_2 without, of sensor_1 with two detections, a turn more
@@ -155,12 +157,12 @@ def make_scans(scene):
         state = scene.advance(state) + scene.root @ rng.standard_normal(scene.root.shape[1])
         for name, (place, sigmas) in scene.sensors.items():
             z = wrapped(scene.observe(state, place) + np.array(sigmas) * rng.standard_normal(2), scene)
-            found = [] if name == "sensor_2" and step in MISSED else [z]
+            detections = [] if name == "sensor_2" and step in MISSED else [z]
             if name == "sensor_1" and step == DOUBLED:
-                found.insert(0, z + scene.far)
+                detections.insert(0, z + scene.far)
             if name == "sensor_1" and step == TURNED and scene.axes[1] == "bearing":
-                found = [z - [0.0, 2 * math.pi]]
-            scans[name].append(found)
+                detections = [z - [0.0, 2 * math.pi]]
+            scans[name].append(detections)
     return scans
 
 
@@ -171,10 +173,10 @@ def fused_steps(scene, scans, rule):
         members = []
         for name, sensor in scene.sensors.items():
             expected, spread, _ = joint(mean, cov, sensor, scene)
-            residuals = [wrapped(z - expected, scene) for z in scans[name][step - 1]]
+            detections = scans[name][step - 1]
+            residuals = [wrapped(z - expected, scene) for z in detections]
             order = sorted(range(len(residuals)), key=lambda i: residuals[i] @ np.linalg.inv(spread) @ residuals[i])
-            found = scans[name][step - 1]
-            members.append(update(mean, cov, found[order[0]], sensor, scene) if order else (mean, cov))
+            members.append(update(mean, cov, detections[order[0]], sensor, scene) if order else (mean, cov))
         mean, cov = rule(members)
         assert np.linalg.eigvalsh(cov).min() > 1e-7
         row = {"track_id": 1, "source": 3, "status": 1, "mean": mean.tolist(), "cov": cov.tolist()}
@@ -196,8 +198,8 @@ def make(directory, name, scene, rules):
     scans = make_scans(scene)
     stamped = {
         sensor: [
-            (step * SECOND_NS, [[*z, sigmas[0] ** 2, 0.0, sigmas[1] ** 2] for z in found])
-            for step, found in enumerate(scans[sensor], start=1)
+            (step * SECOND_NS, [[*z, sigmas[0] ** 2, 0.0, sigmas[1] ** 2] for z in detections])
+            for step, detections in enumerate(scans[sensor], start=1)
         ]
         for sensor, (_, sigmas) in scene.sensors.items()
     }
@@ -211,12 +213,11 @@ def make(directory, name, scene, rules):
         print(f"{path.name}: {len(steps)} steps, ends at {np.round(steps[-1]['tracks'][0]['mean'], 2)}")
 
 
-def main():
-    directory = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent / "golden"
+def main(directory):
     directory.mkdir(parents=True, exist_ok=True)
     make(directory, "turn", TURN, (arithmetic_average, covariance_intersection))
     make(directory, "line", LINE, (arithmetic_average, naive))
 
 
 if __name__ == "__main__":
-    main()
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else GOLDEN)

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from track_fusion.densities.elliptical.elliptical import Family, gaussian, generalized_gaussian, student_t
-from track_fusion.densities.elliptical.projection import ProjectionMean, nearest_mean
+from track_fusion.densities.elliptical.projection import nearest_mean
+from track_fusion.densities.gaussian import weighted_product
 from track_fusion.linalg import Array
 from track_fusion.params import Params, param
-from track_fusion.rules.base import SourceTracks
+from track_fusion.rules.base import FusedTracks, SourceTracks, Values
+from track_fusion.rules.shared.weights import diagnostics
+
+#: Covariances (B, K, n, n) of the tracks as projected to one mean, (33)-(34) -> fused (B, n, n), converged (B,).
+Scatter = Callable[[Array], tuple[Array, NDArray[np.bool_]]]
+
+#: Parameters of examples.
+HEAVY_TAILS: Values = {"family": "generalized_gaussian", "beta": 0.7}
 
 FAMILIES = ("student_t", "generalized_gaussian", "gaussian")
 
@@ -70,21 +80,34 @@ def family_of(tracks: SourceTracks, params: EllipticalParams) -> tuple[Family, A
     return student_t(dof, axes), dof
 
 
-def nearest_mean_of(tracks: SourceTracks, pull: Array, squared: bool) -> ProjectionMean:
-    """Minimise projection distances over the batch of the tracks, flattened to (B, K, n).
+def each(tracks: SourceTracks, constant: Array) -> Array:
+    """Spread a constant of the family, (...) or for all, over the flat batch, (B,)."""
+    return np.broadcast_to(constant, tracks.batch).reshape(-1)
 
-    `pull` (...) is c of the family: scatters are covariances over kappa, so distances by covariances take c kappa.
+
+def fuse_projected(tracks: SourceTracks, params: MhdpParams, scatter: Scatter | None) -> FusedTracks:
+    """Fuse by MHDP: the mean nearest to all tracks (39), and a covariance made of them as projected to it.
+
+    Parameters
+    ----------
+    tracks : SourceTracks       mean (..., K, n), cov (..., K, n, n), dof (..., K) or None
+    params : MhdpParams
+    scatter : Scatter or None   None: the intersection (49)-(50) of the tracks at the weights of the mean
+
+    Returns
+    -------
+    FusedTracks    as of mhdp_iterative
     """
-    *batch, count, n = tracks.mean.shape
-    flat = np.broadcast_to(pull, batch).reshape(-1)
-    return nearest_mean(tracks.mean.reshape(-1, count, n), tracks.cov.reshape(-1, count, n, n), flat, squared)
-
-
-def projected(tracks: SourceTracks, family: Family, squared: bool) -> tuple[ProjectionMean, Array]:
-    """Find the MHDP mean (39) and the tracks' covariances as projected to it, (33)-(34): alpha_k P_k, (B, K, n, n)."""
-    *_, count, n = tracks.mean.shape
-    pull = family.pull * family.kappa
-    found = nearest_mean_of(tracks, pull, squared)
-    flat = np.broadcast_to(pull, tracks.mean.shape[:-2]).reshape(-1, 1)
-    scale = 1.0 + 0.5 * flat * found.distance
-    return found, scale[..., None, None] * tracks.cov.reshape(-1, count, n, n)
+    (mean, cov), (family, dof) = tracks.flat, family_of(tracks, params)
+    # Scatters are covariances over kappa, so distances by covariances take c kappa.
+    pull = each(tracks, family.pull * family.kappa)
+    nearest = nearest_mean(mean, cov, pull, params.criterion == "squared")
+    info = {**diagnostics(nearest), "snapped": nearest.snapped}
+    if scatter is None:
+        fused_cov = weighted_product(mean, cov, nearest.weights)[1]
+    else:
+        alpha = 1.0 + 0.5 * pull[:, None] * nearest.distance
+        fused_cov, converged = scatter(alpha[..., None, None] * cov)
+        info["converged"] = nearest.converged & converged
+    fused = FusedTracks(nearest.mean, fused_cov, nearest.weights, info=info).shaped(tracks.batch)
+    return dataclasses.replace(fused, dof=dof)

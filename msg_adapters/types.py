@@ -1,0 +1,76 @@
+"""The types of messages that source tracks come in, by key. A type is imported when it is asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from msg_adapters.arrays import CrossBlock, TrackArrays
+
+
+class Reading(NamedTuple):
+    """The tracks of a message, and whether something was supplied that its type cannot carry."""
+
+    tracks: TrackArrays
+    supplied: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class MessageType:
+    """How tracks come in messages of one type, each with a std_msgs/Header `header`.
+
+    Attributes
+    ----------
+    message : str        the type as ROS names it, such as "nav_msgs/msg/Odometry"
+    read : callable      (message, axes wanted, what stands for a position-velocity block that is absent) -> Reading;
+                         raises MessageError for what is malformed
+    whole_scan : bool    a message holds all tracks of its stamp; else one track, and a later stamp ends the scan
+    lacks : str          what a message cannot carry, under which readings that supply it are counted; empty: nothing
+    """
+
+    message: str
+    read: Callable[[Any, Sequence[str], CrossBlock], Reading]
+    whole_scan: bool = True
+    lacks: str = ""
+
+    def load(self) -> type:
+        """Import the class of the messages; raise as message_class does."""
+        return message_class(self.message)
+
+
+def message_class(name: str) -> type:
+    """Import the class of a type such as sensor_msgs/msg/PointCloud2.
+
+    Raises
+    ------
+    ImportError    its package is not installed, or has no such message
+    """
+    package, _, kind = name.partition("/msg/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), kind)  # type: ignore[no-any-return]
+    except (ImportError, AttributeError) as error:
+        apt = f"ros-jazzy-{package.replace('_', '-')}"
+        raise ImportError(
+            f"Messages of the type {name} need the package '{package}' ({error}). Install {apt}."
+        ) from error
+
+
+def _read_table(msg: Any, axes: Sequence[str], cross_block: CrossBlock) -> Reading:
+    from msg_adapters.track_table import track_table_from_msg
+
+    return Reading(track_table_from_msg(msg))
+
+
+def _read_odometry(msg: Any, axes: Sequence[str], cross_block: CrossBlock) -> Reading:
+    from msg_adapters.odometry import odometry_from_msg
+
+    return Reading(*odometry_from_msg(msg, axes, cross_block))
+
+
+#: Ours by key: what `source_types` may hold.
+MESSAGE_TYPES: Mapping[str, MessageType] = {
+    "track_table": MessageType("sensor_msgs/msg/PointCloud2", _read_table),
+    "odometry": MessageType("nav_msgs/msg/Odometry", _read_odometry, whole_scan=False, lacks="cross_block"),
+}
