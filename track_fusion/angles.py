@@ -116,7 +116,7 @@ def moments(weight: Array, mean: Array, cov: Array, periods: ArrayLike) -> tuple
     weight : (..., C)       non-negative, not all zero; need not sum to 1
     mean : (..., C, n)
     cov : (..., C, n, n)
-    periods : (n,)
+    periods : (n,), or empty: no axis wraps
 
     Returns
     -------

@@ -11,7 +11,7 @@ import pytest
 from track_fusion.linalg import Array
 from track_fusion.params import from_dict
 from track_fusion.rules import RULES, Mixture, SourceTracks
-from track_fusion.rules.contract import covariances, joint_covariances
+from track_fusion.rules.cases import covariances, joint_covariances
 
 __all__ = ["COUNTER_EXAMPLES", "covariances", "joint_covariances", "rotated", "scalar_nees"]
 

@@ -113,7 +113,7 @@ def _applied(config: CentreConfig, pool: Pool, at: Rows, params: Params, extras:
     if at.shape[1] == 1:
         return first
     try:
-        fused = config.rule.fuse(pool.gather(at, extras, config.rule.takes_particles), params)
+        fused = config.rule.apply(pool.gather(at, extras, config.rule.takes_particles), params)
     except np.linalg.LinAlgError:
         if len(at) == 1:
             return _first(pool, at[:, -1:])._replace(unsound=1)

@@ -136,7 +136,8 @@ class Pool:
             bare = _bare(self.tracks)[at]
             merge = bare & ~bare.all(1, keepdims=True) if take_particles else self.particles[at]
             mixture = self._mixtures(at, merge)
-        return SourceTracks(self.mean[at], self.cov[at], None if np.isinf(dof).all() else dof, mixture, extras)
+        dof_or_none = None if np.isinf(dof).all() else dof
+        return SourceTracks(self.mean[at], self.cov[at], dof_or_none, mixture, extras, self.tracks.layout.periods)
 
     def _mixtures(self, at: Rows, merge: Bools) -> Mixture:
         """Mixtures of members (M, K); those of `merge`, (M, K), by their Gaussians."""

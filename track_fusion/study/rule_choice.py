@@ -39,7 +39,7 @@ class RuleChoice:
 
     def fuse(self, tracks: SourceTracks) -> FusedTracks:
         """Fuse tracks that are known to be sound."""
-        return self.rule.fuse(tracks, self.params)
+        return self.rule.apply(tracks, self.params)
 
 
 def fuse_runs(
