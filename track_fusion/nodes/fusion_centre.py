@@ -177,6 +177,7 @@ class FusionCentreNode(ManagedNode):
             self.counted["steps"] += 1
             self.counted["unconverged"] += result.info.unconverged
             self.counted["unsound"] += result.info.unsound
+            self.counted["beyond_half_circle"] += result.info.beyond_half_circle
             self.counted["deleted"] += len(result.info.changes.deleted)
             began = time.perf_counter()
 
@@ -202,6 +203,8 @@ class FusionCentreNode(ManagedNode):
                 warnings.append(f"{name} is silent for {silence:.1f} s")
         if unsound := self.counted["unsound"]:
             warnings.append(f"{unsound} fusions gave no density; a single source was taken instead")
+        if beyond := self.counted["beyond_half_circle"]:
+            warnings.append(f"{beyond} fusions were of angles more than a half circle apart, which have no mean")
         if self._last is not None:
             values["members"] = self._last.members.tolist()
             if self._last.shared_provenance and rule.guarantee != "conservative":
