@@ -16,6 +16,7 @@ from track_fusion.angles import (
     HALF_TURN,
     KNOWN_PERIODS,
     TURN,
+    center,
     difference,
     heaviest,
     interpolate,
@@ -199,6 +200,17 @@ def test_a_half_circle_is_asked_of_every_axis_that_wraps() -> None:
     relative[2, 1, 2] = np.pi / 2 - 1e-7
     relative[3, 1, 2] = np.pi / 2 - 2e-6
     assert within_half_circle(relative, PERIODS).tolist() == [True, False, False, True]
+
+
+def test_the_center_of_a_cloud_is_where_its_vectors_point_and_of_opposites_the_heaviest() -> None:
+    mean = np.array([[4e6, 3.0, 1.5], [2.0, -3.0, -1.5], [7.0, 0.5, 0.3]])
+    got = center(np.array([0.4, 0.4, 0.2]), mean, PERIODS)
+    assert got[0] == 4e6  # the heaviest, the first of equals
+    for axis, period in enumerate(PERIODS[1:], 1):
+        total = (np.array([0.4, 0.4, 0.2]) * np.exp(2j * np.pi / period * mean[:, axis])).sum()
+        assert got[axis] == pytest.approx(np.angle(total) * period / TURN, abs=1e-12)
+    opposite = np.array([[1.0, 2.0, 0.2], [5.0, 2.0 - np.pi, 0.2 + np.pi / 2]])
+    np.testing.assert_array_equal(center(np.array([0.5, 0.5]), opposite, PERIODS), opposite[0])
 
 
 def test_the_reference_is_the_heaviest_or_the_most_certain_and_the_first_of_equals() -> None:

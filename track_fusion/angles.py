@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from track_fusion import linalg
 from track_fusion.linalg import Array, logdet, merged_moments
 
 #: Period of a direction, radians.
@@ -82,6 +83,19 @@ def heaviest(weight: Array, mean: Array) -> Array:
     return np.asarray(np.take_along_axis(mean, at, -2)[..., 0, :])
 
 
+def center(weight: Array, mean: Array, periods: ArrayLike) -> Array:
+    """Return what weighted states are told relative to, (..., K), (..., K, n), (n,) -> (..., n).
+
+    In axes that wrap it is the direction of the sum of their unit vectors, which a wide cloud has, too; in the others,
+    and where the vectors cancel, that of the heaviest.
+    """
+    wraps = np.isfinite(periods)
+    phase = np.where(wraps, TURN / np.asarray(periods, np.float64), 0.0)
+    total = np.einsum("...k,...kn->...n", weight, np.exp(1j * phase * mean))
+    clear = wraps & (np.abs(total) > OPPOSITE * weight.sum(-1)[..., None])
+    return np.where(clear, np.angle(total) / np.where(wraps, phase, 1.0), heaviest(weight, mean))
+
+
 def most_certain(mean: Array, cov: Array) -> Array:
     """Return the mean of the least determinant, (..., K, n), (..., K, n, n) -> (..., n); of equal ones the first.
 
@@ -109,7 +123,7 @@ def within_half_circle(relative: Array, periods: ArrayLike) -> NDArray[np.bool_]
 
 
 def moments(weight: Array, mean: Array, cov: Array, periods: ArrayLike) -> tuple[Array, Array]:
-    """Merge weighted components into mean and covariance, relative to the heaviest.
+    """Merge weighted components into mean and covariance, relative to their :func:`center`.
 
     Parameters
     ----------
@@ -122,15 +136,26 @@ def moments(weight: Array, mean: Array, cov: Array, periods: ArrayLike) -> tuple
     -------
     mean (..., n) wrapped, cov (..., n, n)
 
-    Notes     Beyond a half circle they are the moments about the heaviest component, wrapped: there is no mean
-              direction, and another reference gives another result.
+    Notes     Beyond a half circle another reference gives another result.
     """
     weight = weight / weight.sum(-1, keepdims=True)
     if not np.isfinite(periods).any():
         return merged_moments(mean, cov, weight)
-    reference = heaviest(weight, mean)
+    reference = center(weight, mean, periods)
     shift, merged = merged_moments(difference(mean, reference[..., None, :], periods), cov, weight)
     return shifted(reference, shift, periods), merged
+
+
+def sample_moments(weight: Array, points: Array, periods: ArrayLike) -> tuple[Array, Array]:
+    """Mean (..., n), wrapped, and covariance (..., n, n) of weighted samples, as :func:`moments` of such components.
+
+    Shapes (..., S), sum one, (..., S, n), and (n,), or empty: no axis wraps.
+    """
+    if not np.isfinite(periods).any():
+        return linalg.sample_moments(weight, points)
+    reference = center(weight, points, periods)
+    shift, cov = linalg.sample_moments(weight, difference(points, reference[..., None, :], periods))
+    return shifted(reference, shift, periods), cov
 
 
 def interpolate(start: Array, end: Array, share: Array, periods: ArrayLike) -> Array:

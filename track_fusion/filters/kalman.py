@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from track_fusion.angles import difference
 from track_fusion.filters.base import Gaussian, GaussianFilter, Innovation
 from track_fusion.linalg import Array, mahalanobis_squared, matvec, solve, symmetrise, transpose
 from track_fusion.models.base import Transition
@@ -63,4 +64,5 @@ class Kalman(GaussianFilter):
         z : (..., m)
         sensor : LinearSensor    H (m, n), or one for each state (..., m, n), and R
         """
-        return condition(state, z - matvec(sensor.matrix, state.mean), sensor.matrix, sensor.noise)
+        residual = difference(z, matvec(sensor.matrix, state.mean), sensor.periods)
+        return condition(state, residual, sensor.matrix, sensor.noise)

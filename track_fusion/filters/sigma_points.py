@@ -40,11 +40,26 @@ class SigmaPoints:
 
 
 def expected_measurement(mean: Array, sigma: Array, sensor: Sensor, points: SigmaPoints) -> tuple[Array, Array]:
-    """Return the expected measurement (..., m) and its deviations at the points (..., P, m), angles wrapped."""
+    """Return the expected measurement (..., m) and its deviations at the points (..., P, m), angles unrolled."""
     reference = sensor.observe(mean)
-    turned = sensor.residual(sensor.observe(sigma), reference[..., None, :])
+    turned = unrolled(mean, sigma, reference, sensor)
     shift = points.mean(turned)
     return reference + shift, turned - shift[..., None, :]
+
+
+def unrolled(mean: Array, sigma: Array, reference: Array, sensor: Sensor) -> Array:
+    """Return by how much the points' measurements differ from that of the mean, (..., P, m).
+
+    The short way round may be the wrong one for an axis of the state itself: where a difference was wrapped, it is
+    summed over two steps, to the point halfway and from there. So a direction whose standard deviation is 90 degrees
+    is measured as if it did not wrap, up to points a whole turn away.
+    """
+    seen = sensor.observe(sigma)
+    turned = sensor.residual(seen, reference[..., None, :])
+    if np.array_equal(turned, seen - reference[..., None, :]):
+        return turned
+    halfway = sensor.observe(0.5 * (sigma + mean[..., None, :]))
+    return sensor.residual(halfway, reference[..., None, :]) + sensor.residual(seen, halfway)
 
 
 class SigmaPointFilter(GaussianFilter, ABC):
@@ -73,7 +88,7 @@ class SigmaPointFilter(GaussianFilter, ABC):
     def update(self, state: Gaussian, z: Array, sensor: Sensor) -> tuple[Gaussian, Innovation]:
         """Condition on z = h(x) + v by the joint Gaussian that the points give.
 
-        Angles are averaged about the measurement of the mean and wrapped. The posterior covariance is summed from the
+        Angles are averaged about the measurement of the mean. The posterior covariance is summed from the
         points' remaining deviations, so that it stays definite when all weights are positive.
 
         Parameters

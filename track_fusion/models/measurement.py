@@ -91,7 +91,7 @@ class RangeBearingSensor:
     """
 
     axes = ("range", "bearing")
-    _periods = np.array([np.inf, TURN])
+    periods = (np.inf, TURN)
 
     def __init__(
         self, layout: StateLayout, range_sd: float, bearing_sd: float, location: tuple[float, ...] = ()
@@ -118,7 +118,7 @@ class RangeBearingSensor:
 
     def residual(self, z: Array, expected: Array) -> Array:
         """Return z - expected, (..., 2), the bearing wrapped."""
-        return difference(z, expected, self._periods)
+        return difference(z, expected, self.periods)
 
     def positions(self, z: Array, noise: Array | None = None) -> tuple[Array, Array]:
         """Turn detections into positions (..., 2) with covariances (..., 2, 2), by linearisation.

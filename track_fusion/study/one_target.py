@@ -89,11 +89,11 @@ def same_filters(one: TrackFilter[Gaussian, Transition, Array, Any, Any]) -> Fil
     return Filters(lambda draws, name: one)
 
 
-def sir_filters(params: SirParams) -> Filters:
+def sir_filters(params: SirParams, periods: Sequence[float] = ()) -> Filters:
     """Give each sensor a particle filter with a stream of its own in each run."""
 
     def of(draws: Draws, name: str) -> Sir:
-        return Sir(dataclasses.replace(params, seed=draws.seed, role=f"sir {name}"), tuple(draws.runs))
+        return Sir(dataclasses.replace(params, seed=draws.seed, role=f"sir {name}"), tuple(draws.runs), periods)
 
     return Filters(of, SIR_CHUNK)
 
@@ -158,8 +158,9 @@ def sir_rows(tracking: Tracking, sir: SirParams, choices: Sequence[RuleChoice]) 
 
     Without fusion also by multinomial resampling, whose draws are independent and add more noise.
     """
-    filters = sir_filters(sir)
-    noisier = sir_filters(dataclasses.replace(sir, resampling="multinomial"))
+    periods = tracking.layout.periods
+    filters = sir_filters(sir, periods)
+    noisier = sir_filters(dataclasses.replace(sir, resampling="multinomial"), periods)
     table = {"sir-alone": alone_row(tracking, filters, 1), "sir-ic": alone_row(tracking, filters, 2)}
     table |= {f"{row}@multinomial": alone_row(tracking, noisier, i) for i, row in enumerate(list(table), 1)}
     for choice in choices:
