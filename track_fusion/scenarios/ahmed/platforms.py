@@ -115,7 +115,7 @@ def fuse_modes(choice: RuleChoice, seed: int) -> Fuse[MixtureModes]:
 
     def fuse(own: MixtureModes, heard: MixtureModes, common: MixtureModes | None, count: int) -> MixtureModes:
         extras = {"seed": np.random.default_rng([seed, count])} if "seed" in choice.rule.optional else {}
-        fused = choice.fuse(SourceTracks.of(stacked(own.mixture, heard.mixture), **extras))
+        fused = choice.fuse(SourceTracks.of(stacked(own.mixture, heard.mixture), (), **extras))
         log_eta = fused.info.get("log_eta", np.zeros(own.probability.shape))
         return MixtureModes(normalised(log_of(own.probability) + log_eta), fused.density)
 
