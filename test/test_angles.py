@@ -11,10 +11,8 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from msg_adapters.arrays import ANGLES
 from track_fusion.angles import (
     HALF_TURN,
-    KNOWN_PERIODS,
     TURN,
     center,
     difference,
@@ -261,10 +259,6 @@ def test_periods_follow_from_names_unless_given() -> None:
     for wrong in ((TURN,), (np.inf, 0.0), (np.inf, np.nan)):
         with pytest.raises(ValueError, match="must be 2 numbers > 0, infinite where an axis does not wrap. Got"):
             StateLayout(("x", "yaw"), wrong)
-
-
-def test_the_adapters_know_the_same_names() -> None:
-    assert set(KNOWN_PERIODS) == ANGLES
 
 
 def test_a_part_of_a_layout_keeps_its_periods() -> None:
