@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from ros_helpers import Probe
 from sensor_msgs.msg import PointCloud2
 
-from track_fusion.demo.bringup import Bringup, bringups, local_environment, running, start_scenario
+from track_fusion.demo.bringup import local_environment, running, start_scenario
+from track_fusion.demo.wiring import Bringup, bringups
 from track_fusion.rules import RULES, get_rule
 from track_fusion.scenarios import RuleChoice, get_scenario
 from track_fusion.scenarios.chen2022.dynamic import fusions

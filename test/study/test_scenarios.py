@@ -1,5 +1,6 @@
 """What scenarios share: rules over runs, verdicts, the list."""
 
+import dataclasses
 import json
 import math
 import os
@@ -14,7 +15,7 @@ from track_fusion.rules import RULES, SourceTracks
 from track_fusion.scenarios import SCENARIOS, get_scenario, judged_figures
 from track_fusion.scenarios.ahmed import search as ahmed_search
 from track_fusion.study.judgement import verdict
-from track_fusion.study.rule_choice import RuleChoice, check_needs, compare_each, fuse_runs
+from track_fusion.study.rule_choice import RuleChoice, check_needs, fuse_runs, rule_by_rule
 from track_fusion.study.scenario import Claim, Printed, Scenario
 
 # ---- rules over runs that share their covariances --------------------------------------------------------------------
@@ -118,14 +119,15 @@ def test_least_and_greatest_of_figures():
 
 def test_comparing_each_names_what_it_measures_and_refuses_first():
     choices, shares = [RuleChoice(key, RULES[key].params()) for key in ("naive", "covariance_union")], []
-    found = compare_each("kf", choices, shares.append, lambda choice: {"m_1": np.full(2, len(choice.key))})
+    found = rule_by_rule("kf", choices, shares.append, lambda choice: {"m_1": np.full(2, len(choice.key))})
     assert {name: values.tolist() for name, values in found.items()} == {
         "kf-naive/m_1": [5.0, 5.0], "kf-covariance_union/m_1": [16.0, 16.0],
     }  # fmt: skip
     assert shares == [0.5, 1.0]
     needy = RuleChoice("split_covariance_intersection", RULES["split_covariance_intersection"].params())
+    comparing = dataclasses.replace(scenario({}), scores=lambda *asked: pytest.fail("measured"))
     with pytest.raises(ParameterError, match="which needs 'independent_cov' beside the tracks"):
-        compare_each("kf", [choices[0], needy], shares.append, lambda choice: pytest.fail("measured"))
+        comparing.compare([choices[0], needy], [0], 0, shares.append)
 
 
 def test_ordering_only_where_it_stands_to_every_other_row_as_published():

@@ -48,7 +48,7 @@ def compare(name: str, rules: str, params: str, runs: int | None, seed: int, job
     from track_fusion.study.study import Study, choice
 
     scenario = find_scenario(name)
-    if scenario.compare is None:
+    if scenario.scores is None:
         raise ParameterError(f"The scenario '{scenario.key}' fuses no tracks by a rule: nothing to compare.")
     specs = rule_specs(rules, params)
     chosen = [choice(scenario, spec) for spec in specs]

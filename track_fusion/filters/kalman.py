@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from track_fusion.angles import difference
+from track_fusion.angles import wrap
 from track_fusion.filters.base import Gaussian, GaussianFilter, Innovation
 from track_fusion.linalg import Array, mahalanobis_squared, matvec, solve, symmetrise, transpose
 from track_fusion.models.base import Transition
@@ -24,8 +24,9 @@ def joseph(cov: Array, gain: Array, slope: Array, noise: Array) -> Array:
     return np.asarray(keep @ cov @ transpose(keep) + gain @ noise @ transpose(gain))
 
 
-def condition(state: Gaussian, residual: Array, slope: Array, noise: Array) -> tuple[Gaussian, Innovation]:
-    """Condition on the residual z - h(x) (..., m) of a sensor of slope H (..., m, n) and noise R (..., m, m)."""
+def condition(state: Gaussian, z: Array, slope: Array, noise: Array) -> tuple[Gaussian, Innovation]:
+    """Condition on z = H x + v (..., m) of a sensor of slope H (..., m, n) and noise R (..., m, m)."""
+    residual = z - matvec(slope, state.mean)
     gain, spread = linear_gain(state.cov, slope, noise)
     posterior = symmetrise(joseph(state.cov, gain, slope, noise))
     innovation = Innovation(residual, spread, mahalanobis_squared(residual, spread))
@@ -64,5 +65,7 @@ class Kalman(GaussianFilter):
         z : (..., m)
         sensor : LinearSensor    H (m, n), or one for each state (..., m, n), and R
         """
-        residual = difference(z, matvec(sensor.matrix, state.mean), sensor.periods)
-        return condition(state, residual, sensor.matrix, sensor.noise)
+        gap = z - matvec(sensor.matrix, state.mean)
+        # So many whole turns more or less bring an angle next to what is expected; elsewhere it is nothing at all.
+        turns = wrap(gap, sensor.periods) - gap
+        return condition(state, z + turns, sensor.matrix, sensor.noise)

@@ -91,8 +91,32 @@ class SourceTracks:
     @property
     def flat(self) -> tuple[Array, Array]:
         """Mean (B, K, n) and cov (B, K, n, n), the leading axes as one."""
+        if self.mean.ndim == 2:
+            return self.mean[None], self.cov[None]
         tail = self.cov.shape[-3:]
         return self.mean.reshape(-1, *tail[:2]), self.cov.reshape(-1, *tail)
+
+    def fused(
+        self,
+        mean: Array,
+        cov: Array,
+        weights: Array | None = None,
+        mixture: Mixture | None = None,
+        info: Mapping[str, NDArray[Any]] | None = None,
+    ) -> FusedTracks:
+        """Return what the flat batch (B, ...) was fused to, with the leading axes of these tracks."""
+        batch = self.batch
+
+        def shape(array: NDArray[Any]) -> NDArray[Any]:
+            return array.reshape(batch + array.shape[1:]) if batch else array[0, ...]
+
+        return FusedTracks(
+            shape(mean),
+            shape(cov),
+            None if weights is None else shape(weights),
+            mixture=mixture and Mixture(*map(shape, vars(mixture).values())),
+            info={name: shape(array) for name, array in info.items()} if info else {},
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,17 +152,6 @@ class FusedTracks:
             mean = angles.shifted(reference[..., None, :], mixture.mean, periods)
             mixture = dataclasses.replace(mixture, mean=mean)
         return dataclasses.replace(self, mean=angles.shifted(reference, self.mean, periods), mixture=mixture)
-
-    def shaped(self, batch: tuple[int, ...]) -> FusedTracks:
-        """Give the arrays of a flat batch (B, ...) their leading axes back."""
-
-        def shape(array: NDArray[Any]) -> NDArray[Any]:
-            return array.reshape((*batch, *array.shape[1:]))
-
-        info = {name: shape(array) for name, array in self.info.items()}
-        weights, dof = (None if array is None else shape(array) for array in (self.weights, self.dof))
-        mixture = self.mixture and Mixture(*map(shape, vars(self.mixture).values()))
-        return FusedTracks(shape(self.mean), shape(self.cov), weights, dof, mixture, info)
 
 
 Values = Mapping[str, Any]

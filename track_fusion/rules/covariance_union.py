@@ -78,7 +78,7 @@ def fuse(tracks: SourceTracks, params: CovarianceUnionParams) -> FusedTracks:
         if params.bound != "optimal":
             raise ValueError(f"The 'mean' parameter 'optimal' needs bound 'optimal'. Got bound {params.bound!r}.")
         best = bound_anywhere(means, covs, criterion)
-        return FusedTracks(best.mean, best.cov, info=diagnostics(best)).shaped(tracks.batch)
+        return tracks.fused(best.mean, best.cov, info=diagnostics(best))
     if params.mean == "diversity":
         share = merging_weights(means, covs).weights
     else:
@@ -88,11 +88,11 @@ def fuse(tracks: SourceTracks, params: CovarianceUnionParams) -> FusedTracks:
     mean = origin + (share[..., None] * (means - origin[:, None])).sum(1)
     if params.bound == "optimal":
         best = bound_about(mean, means, covs, criterion)
-        return FusedTracks(best.mean, best.cov, share, info=diagnostics(best)).shaped(tracks.batch)
+        return tracks.fused(best.mean, best.cov, share, info=diagnostics(best))
     sides = covs + outer(mean[:, None] - means)
     traces = np.trace(sides, axis1=-2, axis2=-1)
     chosen = traces.argmax(1) if params.bound == "max_trace" else traces.argmin(1)
-    return FusedTracks(mean, sides[np.arange(len(sides)), chosen], share).shaped(tracks.batch)
+    return tracks.fused(mean, sides[np.arange(len(sides)), chosen], share)
 
 
 UNEQUAL = (TRACE, {**TRACE, "mean": "optimal"}, {"bound": "max_trace"}, {"bound": "min_trace"})

@@ -61,7 +61,7 @@ def fuse(tracks: SourceTracks, params: CrossCovarianceParams) -> FusedTracks:
     """
     (mean, cov), (count, n) = tracks.flat, tracks.mean.shape[-2:]
     if count == 1:
-        return FusedTracks(mean[:, 0].copy(), cov[:, 0].copy()).shaped(tracks.batch)
+        return tracks.fused(mean[:, 0].copy(), cov[:, 0].copy())
     lower = np.linalg.cholesky(cov.sum(1))
     whiten = np.linalg.inv(lower)[:, None]
     own = symmetrise(whiten @ cov @ transpose(whiten))
@@ -78,7 +78,7 @@ def fuse(tracks: SourceTracks, params: CrossCovarianceParams) -> FusedTracks:
     shift = matvec(weight, matvec(whiten, mean - mean[:, :1])).sum(1)
     fused_mean = mean[:, 0] + matvec(lower, shift)
     fused_cov = symmetrise(lower @ fused @ transpose(lower))
-    return FusedTracks(fused_mean, fused_cov).shaped(tracks.batch)
+    return tracks.fused(fused_mean, fused_cov)
 
 
 def _cross_cov(tracks: SourceTracks) -> Array:

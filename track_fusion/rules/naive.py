@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 
+from track_fusion.densities.gaussian import weighted_product
 from track_fusion.params import Params
 from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
-from track_fusion.rules.shared.weights import pooled
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +39,7 @@ def fuse(tracks: SourceTracks, params: NaiveParams) -> FusedTracks:
     References     T. Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average
                    Density Fusion, eq. (14).
     """
-    return dataclasses.replace(pooled(tracks, np.ones(tracks.mean.shape[:-1])), weights=None)
+    return FusedTracks(*weighted_product(tracks.mean, tracks.cov, np.ones(tracks.mean.shape[:-1])))
 
 
 RULE = Rule(

@@ -58,14 +58,14 @@ def fuse(tracks: SourceTracks, params: SplitCovarianceIntersectionParams) -> Fus
     parts = _Parts.of(mean, cov, alone)
     if tracks.count == 1:
         ones = np.ones(mean.shape[:2])
-        own = FusedTracks(mean[:, 0].copy(), cov[:, 0].copy(), ones, info={"independent_cov": alone[:, 0].copy()})
-        return own.shaped(tracks.batch)
+        info = {"independent_cov": alone[:, 0].copy()}
+        return tracks.fused(mean[:, 0].copy(), cov[:, 0].copy(), ones, info=info)
     if weights is None:
         search = minimise_on_simplex(_gradient_hessian(parts, params.criterion), len(mean), tracks.count)
         weights, info = search.weights, diagnostics(search)
     weights = weights.reshape(mean.shape[:2])
     fused_mean, fused_cov, left = parts.fused_at(weights, mean[:, 0])
-    return FusedTracks(fused_mean, fused_cov, weights, info={**info, "independent_cov": left}).shaped(tracks.batch)
+    return tracks.fused(fused_mean, fused_cov, weights, info={**info, "independent_cov": left})
 
 
 def _independent(tracks: SourceTracks) -> Array:

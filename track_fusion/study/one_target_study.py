@@ -14,7 +14,7 @@ from track_fusion.rules import FusedTracks
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.one_target import Row, drawn
 from track_fusion.study.rows import Outcomes, Progress, chosen
-from track_fusion.study.rule_choice import RuleChoice, check_needs
+from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.study.scene import Tracking
 
 TRUTH = "truth/position_m"
@@ -109,14 +109,8 @@ class OneTargetStudy:
             assert fused.weights is not None
             into[WEIGHT][...] = fused.weights[:, 0]
 
-    def compare(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
-        """Root of the time-averaged squared error of each run, (R,), under rules of any family, with feedback.
-
-        Raises
-        ------
-        ParameterError    a rule needs more than the tracks
-        """
-        check_needs(rules)
+    def scores(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
+        """Root of the time-averaged squared error of each run, (R,), under rules of any family, with feedback."""
         name, row = self.compared
         outcomes = self._run({f"{name}-{choice.name}": row(choice) for choice in rules}, runs, seed, progress)
         return {

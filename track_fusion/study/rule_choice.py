@@ -102,24 +102,14 @@ def check_needs(choices: Sequence[RuleChoice], given: Collection[str] = ()) -> N
             )
 
 
-def compare_each(
-    name: str,
-    rules: Sequence[RuleChoice],
-    progress: Progress,
-    measure: Callable[[RuleChoice], Mapping[str, Array]],
-    given: Collection[str] = (),
+def rule_by_rule(
+    name: str, rules: Sequence[RuleChoice], progress: Progress, measure: Callable[[RuleChoice], Mapping[str, Array]]
 ) -> Outcomes:
-    """Measure any rules one after the other: what many scenarios' `compare` is.
+    """Measure any rules one after the other: what many scenarios' `scores` are.
 
     Parameters
     ----------
     name : str            of the filter, the beginning of the figures' names
     measure : callable    rule -> {quantity and unit: (R,)}
-    given                 extras that the scenario has for rules that need them
-
-    Raises
-    ------
-    ParameterError    a rule needs something else
     """
-    check_needs(rules, given)
     return row_by_row({f"{name}-{choice.name}": choice for choice in rules}, progress, measure)

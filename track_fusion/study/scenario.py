@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.study.chart import Chart
 from track_fusion.study.rows import Outcomes, Progress
-from track_fusion.study.rule_choice import RuleChoice
+from track_fusion.study.rule_choice import RuleChoice, check_needs
 from track_fusion.study.scene import Scene, Tracking
 from track_fusion.tracks import TrackBatch
 
@@ -105,8 +105,9 @@ class Scenario:
     judge : callable | None    (row, tracks that a centre published, a batch a fusion) -> Outcomes of one run, named as
                                those of `simulate`; None: one target, whose errors the evaluator node tells
     rules : tuple              the rules it compares, with their parameters
-    compare : callable | None  (rules, runs, seed, progress) -> Outcomes, (R,) each, named as figures are: one number a
-                               run for any rules; None = the scenario fuses no tracks
+    given : tuple of str       extras that it has for rules that need more than the tracks
+    scores : callable | None   (rules, runs, seed, progress) -> Outcomes, (R,) each, named as figures are: one number a
+                               run, for any rules that `given` is enough for; None = the scenario fuses no tracks
     """
 
     key: str
@@ -127,7 +128,8 @@ class Scenario:
     scene: Callable[[], Scene] | None = None
     judge: Callable[[str, Sequence[TrackBatch]], Outcomes] | None = None
     rules: tuple[RuleChoice, ...] = ()
-    compare: Callable[[Sequence[RuleChoice], Sequence[int], int, Progress], Outcomes] | None = None
+    given: tuple[str, ...] = ()
+    scores: Callable[[Sequence[RuleChoice], Sequence[int], int, Progress], Outcomes] | None = None
 
     @property
     def over_ros(self) -> bool:
@@ -155,3 +157,14 @@ class Scenario:
     ) -> dict[str, Estimate]:
         """Measure the figures whose names start with `only` over `runs` Monte Carlo runs, at once."""
         return self.figures(self.simulate(range(runs), seed, progress, only))
+
+    def compare(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
+        """Score any rules under the same noise, one number a run, (R,); only where there are `scores`.
+
+        Raises
+        ------
+        ParameterError    a rule needs more than the tracks and what is `given`
+        """
+        check_needs(rules, self.given)
+        assert self.scores is not None
+        return self.scores(rules, runs, seed, progress)

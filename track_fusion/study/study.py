@@ -55,7 +55,6 @@ class Study:
         scenario = self.find(self.scenario)
         if self.rules is None:
             return scenario.simulate(piece, self.seed, _silent, self.only)
-        assert scenario.compare is not None
         return scenario.compare([choice(scenario, spec) for spec in self.rules], piece, self.seed, _silent)
 
 

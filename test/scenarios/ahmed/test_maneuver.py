@@ -162,10 +162,12 @@ def test_charts_and_figures_cope_with_parts(outcomes):
 def test_compare_takes_any_rule_for_two_tracks(monkeypatch):
     monkeypatch.setattr(maneuver, "STEPS", 60)
     rules = [RuleChoice(key, RULES[key].params()) for key in ("covariance_intersection", "naive")]
-    found = maneuver.compare(rules, [0], 0, lambda share: None)
+    found = maneuver.SCENARIO.compare(rules, [0], 0, lambda share: None)
     assert {name: values.shape for name, values in found.items()} == {
         "gsf-covariance_intersection/median_position_error_m": (1,),
         "gsf-naive/median_position_error_m": (1,),
     }
     with pytest.raises(ParameterError, match="Got 'mixture_exact', which needs 'common' beside the tracks"):
-        maneuver.compare([RuleChoice("mixture_exact", RULES["mixture_exact"].params())], [0], 0, lambda share: None)
+        maneuver.SCENARIO.compare(
+            [RuleChoice("mixture_exact", RULES["mixture_exact"].params())], [0], 0, lambda share: None
+        )

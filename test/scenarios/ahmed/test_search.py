@@ -101,8 +101,8 @@ def test_pieces_equal_the_whole_and_figures_cope_with_a_part(monkeypatch):
 def test_compare_takes_rules_for_peers_only(monkeypatch):
     monkeypatch.setattr(search, "STEPS", 2)
     rules = [RuleChoice("mixture_exact", search.DLS), RuleChoice("naive", RULES["naive"].params())]
-    found = search.compare(rules, [0], 0, lambda share: None)
+    found = search.scores(rules, [0], 0, lambda share: None)
     assert found["gm-mixture_exact/kld_nats"][0] < found["gm-naive/kld_nats"][0]
     split = RuleChoice("split_covariance_intersection", RULES["split_covariance_intersection"].params())
     with pytest.raises(ParameterError, match="needs 'independent_cov', which peers do not exchange"):
-        search.compare([split], [0], 0, lambda share: None)
+        search.scores([split], [0], 0, lambda share: None)

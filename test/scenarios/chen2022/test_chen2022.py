@@ -93,12 +93,12 @@ def test_distance_to_the_geodesic_is_that_of_a_fine_grid() -> None:
 
 def test_static_comparison_takes_any_rule_that_needs_only_tracks() -> None:
     choices = [RuleChoice(k, RULES[k].params()) for k in ("mhdp_explicit", "covariance_union", "mixture_average")]
-    found = static.compare(choices, range(3), 0, silent)
+    found = static.SCENARIO.compare(choices, range(3), 0, silent)
     assert len(found) == 18
     assert all(values.shape == (3,) and (values >= 0).all() for values in found.values())
     np.testing.assert_allclose(found["given-mhdp_explicit/rao_distance_gg065_1"], 0.0236, atol=1e-4)
     with pytest.raises(ParameterError, match="split_covariance_intersection"):
-        static.compare(
+        static.SCENARIO.compare(
             [RuleChoice("split_covariance_intersection", SplitCovarianceIntersectionParams())], [0], 0, silent
         )
 
@@ -228,8 +228,7 @@ def test_only_the_rows_asked_for_are_run() -> None:
 
 def test_comparison_is_the_root_of_the_time_averaged_square() -> None:
     choices, scenario = (dynamic.RULE_CHOICES[3], dynamic.RULE_CHOICES[5]), case_2.SCENARIO
-    assert scenario.compare is not None
-    found = dynamic.compared(SHORT["II"], choices, [0, 4], 2, silent)
+    found = dynamic.scores(SHORT["II"], choices, [0, 4], 2, silent)
     outcomes = dynamic.squared_errors(SHORT["II"], dynamic.rows(choices), [0, 4], 2, silent)
     wanted = np.sqrt(outcomes[f"stf-{MHDP_E}"].mean(1))
     np.testing.assert_allclose(found[f"stf-{MHDP_E}/position_rmse_m"], wanted, rtol=1e-12)

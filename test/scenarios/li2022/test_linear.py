@@ -204,7 +204,7 @@ def test_charts_show_every_quantity_of_every_filter():
 
 
 def test_compared_rules_are_the_rows_of_the_table():
-    found = STUDY.compare(RULE_CHOICES[:2], range(4), 3, lambda share: None)
+    found = SCENARIO.compare(RULE_CHOICES[:2], range(4), 3, lambda share: None)
     rows = sampled({n: KALMAN[n] for n in ("kf-naive", "kf-arithmetic_average")}, range(4), 3)
     assert list(found)[:2] == ["kf-naive/position_rmse_m", "kf-naive/velocity_rmse_mps"]
     for rule in ("naive", "arithmetic_average"):
@@ -218,10 +218,10 @@ def test_any_rule_that_needs_tracks_only_is_compared(key):
     choice = RuleChoice(key, rule.params())
     if rule.needed(choice.params):
         with pytest.raises(ParameterError, match=f"Got '{key}', which needs '{rule.needed(choice.params)[0]}'"):
-            STUDY.compare([choice], range(2), 0, lambda share: None)
+            SCENARIO.compare([choice], range(2), 0, lambda share: None)
         return
-    both = STUDY.compare([choice], [5, 1], 0, lambda share: None)
-    alone = STUDY.compare([choice], [1], 0, lambda share: None)
+    both = SCENARIO.compare([choice], [5, 1], 0, lambda share: None)
+    alone = SCENARIO.compare([choice], [1], 0, lambda share: None)
     assert list(both) == [f"kf-{key}/position_rmse_m", f"kf-{key}/velocity_rmse_mps"]
     for name, values in both.items():
         assert 5.0 < values.min() < values.max() < 100.0

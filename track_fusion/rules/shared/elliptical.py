@@ -109,5 +109,5 @@ def fuse_projected(tracks: SourceTracks, params: MhdpParams, scatter: Scatter | 
         alpha = 1.0 + 0.5 * pull[:, None] * nearest.distance
         fused_cov, converged = scatter(alpha[..., None, None] * cov)
         info["converged"] = nearest.converged & converged
-    fused = FusedTracks(nearest.mean, fused_cov, nearest.weights, info=info).shaped(tracks.batch)
+    fused = tracks.fused(nearest.mean, fused_cov, nearest.weights, info=info)
     return dataclasses.replace(fused, dof=dof)

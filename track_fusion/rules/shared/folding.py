@@ -56,7 +56,7 @@ def fold(tracks: SourceTracks, kernel: PairKernel, given: Array | None = None) -
             weights = np.concatenate([weights * omega, 1.0 - omega], 1)
             info["converged"] = info.get("converged", True) & search.converged
             info["iterations"] = info.get("iterations", 0) + search.iterations
-    return FusedTracks(mean, cov, weights if weighed else None, info=info).shaped(tracks.batch)
+    return tracks.fused(mean, cov, weights if weighed else None, info=info)
 
 
 def _in_pieces(kernel: PairKernel, x1: Array, p1: Array, x2: Array, p2: Array, given: float | None) -> PairFusion:

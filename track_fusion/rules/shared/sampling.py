@@ -40,7 +40,7 @@ def fuse_sampled(
     if size <= step:
         return fuse(tracks, [np.random.default_rng(s) for s in seeds])
     pieces = (_piece(tracks, lead, slice(at, at + step)) for at in range(0, size, step))
-    return _joined([fuse(p, [np.random.default_rng(s) for s in seeds]) for p in pieces], lead)
+    return _joined([fuse(p, [np.random.default_rng(s) for s in seeds]) for p in pieces], tracks)
 
 
 def _piece(tracks: SourceTracks, lead: tuple[int, ...], rows: slice) -> SourceTracks:
@@ -56,16 +56,16 @@ def _piece(tracks: SourceTracks, lead: tuple[int, ...], rows: slice) -> SourceTr
     return SourceTracks(tracks.mean[index], tracks.cov[index], None, mixture, extras)
 
 
-def _joined(results: list[FusedTracks], lead: tuple[int, ...]) -> FusedTracks:
+def _joined(results: list[FusedTracks], tracks: SourceTracks) -> FusedTracks:
     """Put pieces together again, their mixtures padded to the same number of components."""
     mixtures = [r.mixture for r in results if r.mixture is not None]
     count = max((m.count for m in mixtures), default=0)
     columns = zip(*(vars(padded(m, count)).values() for m in mixtures), strict=True)
     weights = [r.weights for r in results if r.weights is not None]
-    return FusedTracks(
+    return tracks.fused(
         np.concatenate([r.mean for r in results]),
         np.concatenate([r.cov for r in results]),
         np.concatenate(weights) if weights else None,
         mixture=Mixture(*map(np.concatenate, columns)) if mixtures else None,
         info={name: np.concatenate([r.info[name] for r in results]) for name in results[0].info},
-    ).shaped(lead)
+    )

@@ -84,7 +84,7 @@ def pooled_by(find: Callable[[Array, Array], Solution | ProjectionMean], tracks:
     mean, cov = tracks.flat
     search = find(mean, cov)
     moments = weighted_product(mean, cov, search.weights)
-    return FusedTracks(*moments, search.weights, info=diagnostics(search)).shaped(tracks.batch)
+    return tracks.fused(*moments, search.weights, info=diagnostics(search))
 
 
 def diagnostics(search: Solution | ProjectionMean | Bound) -> dict[str, Any]:

@@ -233,13 +233,8 @@ def _of_fusion(outcomes: Outcomes, row: str) -> dict[str, Estimate]:
     return estimates
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
-    """Median position error over platforms and fusions, in metres, of each run (R,), for any rule for two tracks.
-
-    Raises
-    ------
-    ParameterError    a rule needs something beside the tracks
-    """
+def scores(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
+    """Median position error over platforms and fusions, in metres, of each run (R,), for any rule for two tracks."""
     ways: dict[str, Fuse[MixtureModes]] = {f"gsf-{choice.name}": fuse_modes(choice, seed) for choice in rules}
     study, errors_m = Study(runs, seed, STEPS, progress, len(ways)), {}
     for row, fuse in ways.items():
@@ -390,5 +385,5 @@ SCENARIO = Scenario(
     claims=CLAIMS,
     piece=1,
     rules=RULE_CHOICES,
-    compare=compare,
+    scores=scores,
 )

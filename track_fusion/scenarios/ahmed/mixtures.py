@@ -18,7 +18,7 @@ from track_fusion.random_streams import stream
 from track_fusion.rules import FusedTracks, SourceTracks
 from track_fusion.study.chart import Chart, Contours
 from track_fusion.study.rows import Outcomes, Progress, run_by_run
-from track_fusion.study.rule_choice import RuleChoice, check_needs
+from track_fusion.study.rule_choice import RuleChoice
 
 #: Half the sides of the squares in which the sources' and the common information's means lie.
 SOURCE_HALF, COMMON_HALF = 14.0, 20.0
@@ -124,20 +124,14 @@ def _range(used: NDArray[np.bool_]) -> slice:
     return slice(int(at[0]), int(at[-1]) + 1)
 
 
-def compare(
+def scores(
     draw: Callable[[int, int], Problem],
     rules: Sequence[RuleChoice],
     runs: Sequence[int],
     seed: int,
     progress: Progress,
 ) -> Outcomes:
-    """Fuse the problems draw(seed, run) by any rules: divergence of the exactly fused density from what each gives.
-
-    Raises
-    ------
-    ParameterError    a rule needs more beside the tracks than their common information
-    """
-    check_needs(rules, ("common",))
+    """Fuse the problems draw(seed, run) by any rules: divergence of the exactly fused density from what each gives."""
 
     def one(run: int, tell: Progress) -> dict[str, Array]:
         problem = draw(seed, run)

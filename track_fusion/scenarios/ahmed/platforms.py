@@ -19,7 +19,7 @@ from track_fusion.models.turn import KnownTurn, KnownTurnParams
 from track_fusion.peers import Fuse, Peer, Schedule, communicate, ring
 from track_fusion.random_streams import stream
 from track_fusion.rules import SourceTracks
-from track_fusion.study.rule_choice import RuleChoice, check_needs
+from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.trackers.fusion_loop import filtered
 from track_fusion.tracks import StateLayout
 
@@ -106,12 +106,7 @@ def fuse_modes(choice: RuleChoice, seed: int) -> Fuse[MixtureModes]:
     """Fuse mode by mode by a rule; the receiver's mode probabilities count the integrals, (74)-(76).
 
     A rule that knows no such integrals leaves the receiver's mode probabilities alone.
-
-    Raises
-    ------
-    ParameterError    the rule needs something beside two tracks
     """
-    check_needs([choice])
 
     def fuse(own: MixtureModes, heard: MixtureModes, common: MixtureModes | None, count: int) -> MixtureModes:
         extras = {"seed": np.random.default_rng([seed, count])} if "seed" in choice.rule.optional else {}

@@ -37,8 +37,8 @@ from track_fusion.scenarios.ahmed.mixtures import (
     GRID,
     INGIS_VARIANCE,
     Problem,
-    compare,
     contour_chart,
+    scores,
     shown,
 )
 from track_fusion.study.chart import Chart, Series
@@ -288,5 +288,6 @@ SCENARIO = Scenario(
     claims=CLAIMS,
     piece=10,
     rules=RULE_CHOICES,
-    compare=functools.partial(compare, problem),
+    given=("common",),
+    scores=functools.partial(scores, problem),
 )

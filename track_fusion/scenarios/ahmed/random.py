@@ -19,9 +19,9 @@ from track_fusion.scenarios.ahmed import PAPER
 from track_fusion.scenarios.ahmed.mixtures import (
     INGIS_VARIANCE,
     Problem,
-    compare,
     contour_chart,
     log_fused,
+    scores,
     shown,
 )
 from track_fusion.study.chart import Chart, Series
@@ -292,5 +292,6 @@ SCENARIO = Scenario(
     claims=tuple(_claims()),
     piece=2,
     rules=RULE_CHOICES,
-    compare=functools.partial(compare, study_problem),
+    given=("common",),
+    scores=functools.partial(scores, study_problem),
 )

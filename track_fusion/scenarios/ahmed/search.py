@@ -204,15 +204,8 @@ def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     return {name: Estimate.mean(values) for name, values in outcomes.items() if "/" in name}
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
-    """Divergence from the centralised mixture of robot 3's after fusion by any rule for peers, (R,) each.
-
-    Raises
-    ------
-    ParameterError    a rule needs what peers do not exchange
-    """
-    for choice in rules:
-        _fuse(choice, seed)
+def scores(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
+    """Divergence from the centralised mixture of robot 3's after fusion by any rule for peers, (R,) each."""
 
     def one(run: int, tell: Progress) -> dict[str, float]:
         search, divergences = Search(run, seed, tell), {}
@@ -331,5 +324,6 @@ SCENARIO = Scenario(
     claims=CLAIMS,
     piece=1,
     rules=RULE_CHOICES,
-    compare=compare,
+    given=("common",),
+    scores=scores,
 )

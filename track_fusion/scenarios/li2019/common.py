@@ -7,22 +7,8 @@ import numpy as np
 from track_fusion.densities.log_domain import normalised
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.linalg import Array
-from track_fusion.rules import FusedTracks, SourceTracks
-from track_fusion.study.rule_choice import RuleChoice, check_needs
-
-
-def fuse(choice: RuleChoice, tracks: SourceTracks) -> FusedTracks:
-    """Fuse by any rule that can do with the tracks alone.
-
-    Raises
-    ------
-    ParameterError    the rule needs something beside the tracks
-    """
-    check_needs([choice])
-    return choice.fuse(tracks)
-
-
-# Mixtures of one axis.
+from track_fusion.rules import SourceTracks
+from track_fusion.study.rule_choice import RuleChoice
 
 
 def scalar_mixture(weight: Array, mean: Array, variance: Array) -> Mixture:
@@ -45,7 +31,7 @@ def fused_intensity(choice: RuleChoice, parts: Mixture) -> Mixture:
 
     A rule that gives a Gaussian is a mixture of one component.
     """
-    density = fuse(choice, SourceTracks.of(parts)).density.normalised
+    density = choice.fuse(SourceTracks.of(parts)).density.normalised
     return Mixture(expected_number(parts)[..., None] * density.weight, density.mean, density.cov)
 
 

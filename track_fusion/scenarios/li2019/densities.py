@@ -15,7 +15,6 @@ from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.rules.geometric_average import GeometricAverageParams
 from track_fusion.scenarios.li2019 import PAPER
 from track_fusion.scenarios.li2019.averages import density_average, density_moments
-from track_fusion.scenarios.li2019.common import fuse
 from track_fusion.study.chart import Chart, Contours, Series
 from track_fusion.study.rows import Outcomes, Progress, exact_figures, exact_rows
 from track_fusion.study.rule_choice import RuleChoice
@@ -73,7 +72,7 @@ APART = Pair((50.0, 80.0), (100.0, 200.0))
 
 def half_moments(choice: RuleChoice, pair: Pair) -> dict[str, float]:
     """Fuse by a rule: mean and variance."""
-    fused = fuse(choice, pair.tracks)
+    fused = choice.fuse(pair.tracks)
     return {"mean_1": float(fused.mean[0]), "variance_1": float(fused.cov[0, 0])}
 
 
@@ -164,11 +163,11 @@ def _rows() -> dict[str, Callable[[], Mapping[str, float]]]:
 ROWS = _rows()
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
+def scores(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Root of the mean square error (3) of what any rules make of Figs. 5 and 6, averaged over the parameter, (R,)."""
 
     def errors(choice: RuleChoice) -> dict[str, float]:
-        fused = {name: fuse(choice, pair.tracks) for name, pair in PAIRS.items()}
+        fused = {name: choice.fuse(pair.tracks) for name, pair in PAIRS.items()}
         squares = {name: f.cov[0, 0] + (f.mean[0] - THETA) ** 2 for name, f in fused.items()}
         return {f"{name}_rms_error_1": float(np.sqrt(square.mean())) for name, square in squares.items()}
 
@@ -341,5 +340,5 @@ SCENARIO = Scenario(
     claims=CLAIMS,
     piece=1,
     rules=RULE_CHOICES,
-    compare=compare,
+    scores=scores,
 )

@@ -95,7 +95,7 @@ def _rows() -> dict[str, Callable[[], Mapping[str, float]]]:
 ROWS = _rows()
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
+def scores(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Divergence of the two sources from what any rules give, and of that from the sources, both averaged, (R,).
 
     Intensities are normalised. The arithmetic average has the least divergence of the sources from it, the exact
@@ -212,5 +212,5 @@ SCENARIO = Scenario(
     claims=CLAIMS,
     piece=1,
     rules=(AVERAGE, HYBRID),
-    compare=compare,
+    scores=scores,
 )

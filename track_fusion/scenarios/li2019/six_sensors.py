@@ -25,7 +25,7 @@ from track_fusion.scenarios.li2019.common import (
 )
 from track_fusion.study.chart import Chart, Series, estimates
 from track_fusion.study.rows import Outcomes, Progress, chosen, row_by_row
-from track_fusion.study.rule_choice import RuleChoice, compare_each
+from track_fusion.study.rule_choice import RuleChoice, rule_by_rule
 from track_fusion.study.scenario import Claim, Scenario
 
 TARGETS = np.array([20.0, 40.0, 70.0, 110.0, 200.0])
@@ -197,7 +197,7 @@ def _lost_share(row: str, lost: Array, cases: NDArray[np.bool_], count: int) -> 
     return {f"{row}/lost_missed_by_{count}_share_1": Estimate.of_averages(both, lambda m: m[:, 0] / m[:, 1])}
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
+def scores(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Lost targets and mass far from all targets of any rules, each scaled to the mean number of targets, (R,)."""
     parts, _ = trials(runs, seed)
 
@@ -205,7 +205,7 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
         kept = by_rule(choice)(parts)
         return {"lost_targets_1": kept.lost.sum(-1).astype(float), "far_mass_1": kept.far}
 
-    return compare_each("given", rules, progress, measure)
+    return rule_by_rule("given", rules, progress, measure)
 
 
 # Charts and claims.
@@ -315,5 +315,5 @@ SCENARIO = Scenario(
     claims=CLAIMS,
     piece=50,
     rules=(AVERAGE, HYBRID),
-    compare=compare,
+    scores=scores,
 )

@@ -22,7 +22,7 @@ from track_fusion.rules.naive import NaiveParams
 from track_fusion.scenarios.li2022 import PAPER
 from track_fusion.study.chart import Chart, ellipse
 from track_fusion.study.rows import Outcomes, Progress, chosen, row_by_row
-from track_fusion.study.rule_choice import RuleChoice, compare_each
+from track_fusion.study.rule_choice import RuleChoice, rule_by_rule
 from track_fusion.study.scenario import Claim, Scenario
 
 #: The densities of Fig. 1 are not printed. This pair is assumed: trace-optimal covariance intersection gives it the
@@ -155,19 +155,14 @@ def _over_runs(row: str, values: Array) -> Estimate:
     return Estimate.mean(values) if _random(row) else Estimate.exact(values[0])
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
-    """Trace of the fused covariance by case, (R,), under any rules: what is claimed, which need not be true.
-
-    Raises
-    ------
-    ParameterError    a rule needs more than the tracks
-    """
+def scores(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
+    """Trace of the fused covariance by case, (R,), under any rules: what is claimed, which need not be true."""
 
     def measure(choice: RuleChoice) -> Outcomes:
         traces = np.array([np.trace(fused("", choice, seed, r).cov, axis1=1, axis2=2) for r in runs])
         return {f"trace_case_{case}_m2": traces[:, i] for i, case in enumerate(SEPARATIONS)}
 
-    return compare_each("given", rules, progress, measure)
+    return rule_by_rule("given", rules, progress, measure)
 
 
 def charts(outcomes: Outcomes) -> list[Chart]:
@@ -273,5 +268,5 @@ SCENARIO = Scenario(
     charts=charts,
     claims=_claims(),
     rules=RULE_CHOICES,
-    compare=compare,
+    scores=scores,
 )

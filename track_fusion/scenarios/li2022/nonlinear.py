@@ -178,5 +178,5 @@ SCENARIO = Scenario(
     piece=50,
     tracking=TRACKING,
     rules=RULE_CHOICES,
-    compare=STUDY.compare,
+    scores=STUDY.scores,
 )

@@ -17,7 +17,7 @@ from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.scenarios.li2022 import PAPER
 from track_fusion.study.chart import Chart, Series, Style
 from track_fusion.study.rows import Outcomes, Progress, exact_rows
-from track_fusion.study.rule_choice import RuleChoice, compare_each
+from track_fusion.study.rule_choice import RuleChoice, rule_by_rule
 from track_fusion.study.scenario import Claim, Scenario
 
 #: Section III-B: mean and variance of the densities and of the target in each case.
@@ -133,20 +133,15 @@ def figures(outcomes: Outcomes) -> dict[str, Estimate]:
     return measured
 
 
-def compare(choices: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
-    """Divergence of the fused Gaussian from the target by case, (R,), under any rules; nothing is random.
-
-    Raises
-    ------
-    ParameterError    a rule needs more than the densities and the target
-    """
+def scores(choices: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
+    """Divergence of the fused Gaussian from the target by case, (R,), under any rules; nothing is random."""
 
     def measure(choice: RuleChoice) -> Outcomes:
         fits = {case: fit(choice, case) for case in TARGETS}
         values = {case: divergence(fused.mean, fused.cov, case) for case, fused in fits.items()}
         return {f"kld_case_{case}_nats": np.full(len(runs), value) for case, value in values.items()}
 
-    return compare_each("given", choices, progress, measure, ("target",))
+    return rule_by_rule("given", choices, progress, measure)
 
 
 def charts(outcomes: Outcomes) -> list[Chart]:
@@ -243,5 +238,6 @@ SCENARIO = Scenario(
     charts=charts,
     claims=_claims(),
     rules=RULE_CHOICES,
-    compare=compare,
+    given=("target",),
+    scores=scores,
 )

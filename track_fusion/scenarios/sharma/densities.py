@@ -18,7 +18,7 @@ from track_fusion.rules import FusedTracks, SourceTracks
 from track_fusion.rules.geometric_mean_sampling import GeometricMeanSamplingParams
 from track_fusion.rules.harmonic_mean import HarmonicMeanParams
 from track_fusion.study.rows import Outcomes, Progress, chosen, row_by_row
-from track_fusion.study.rule_choice import RuleChoice, check_needs
+from track_fusion.study.rule_choice import RuleChoice
 
 #: Weight of both densities in every fusion whose weights are not sought.
 HALF = (0.5, 0.5)
@@ -73,14 +73,8 @@ class Pair:
         """Kullback-Leibler divergence of the exact harmonic mean density from what was fused, in nats."""
         return float(kl_on_grid(self.exact, log_pdf(fused.density, POINTS)))
 
-    def compare(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
-        """Fuse by any rules: divergence of the exact harmonic mean density from each result, (R,).
-
-        Raises
-        ------
-        ParameterError    a rule needs more than the two densities
-        """
-        check_needs(rules)
+    def scores(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
+        """Fuse by any rules: divergence of the exact harmonic mean density from each result, (R,)."""
         outcomes = simulate({f"given-{c.name}": self.by_rule(c) for c in rules}, runs, seed, progress)
         return {name: values for name, values in outcomes.items() if name.endswith("/kld_nats")}
 

@@ -202,5 +202,5 @@ SCENARIO = Scenario(
     ),
     piece=50,
     rules=RULE_CHOICES,
-    compare=PAIR.compare,
+    scores=PAIR.scores,
 )  # fmt: skip

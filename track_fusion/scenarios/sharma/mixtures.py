@@ -110,5 +110,5 @@ SCENARIO = Scenario(
     ),
     piece=50,
     rules=RULE_CHOICES,
-    compare=PAIR.compare,
+    scores=PAIR.scores,
 )

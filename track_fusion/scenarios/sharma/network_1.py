@@ -115,5 +115,5 @@ SCENARIO = Scenario(
     ),
     piece=2500,
     rules=RULE_CHOICES,
-    compare=partial(shared.compare, READINGS[""]),
+    scores=partial(shared.scores, READINGS[""]),
 )  # fmt: skip

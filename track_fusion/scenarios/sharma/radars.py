@@ -29,7 +29,7 @@ from track_fusion.scenarios.sharma.radar_runs import (
 )
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.rows import Outcomes, Progress, chosen
-from track_fusion.study.rule_choice import RuleChoice, check_needs
+from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.study.scenario import Claim, Scenario
 
 #: Fusions from this time on count: before it tracks are still starting.
@@ -174,29 +174,24 @@ def _map(position: Array) -> Chart:
     return Chart("Radars and targets", "east of radar 1, km", "north of radar 1, km", tuple(lines), equal=True)
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
+def scores(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Fuse the same tracks by any rules: error of the tracks found, and share of lost ones, over all targets judged.
 
     Returns
     -------
     {row/position_rmse_m, row/lost_1: (R,)}; the error is REACH_M where a run found nothing
-
-    Raises
-    ------
-    ParameterError    a rule needs more than tracks
     """
-    check_needs(rules)
     table = records(tracked({f"pda-{choice.name}": choice for choice in rules}, runs, seed, progress))
     targets = np.concatenate([category(c) for c in CATEGORIES])
-    scores: Outcomes = {}
+    columns: Outcomes = {}
     for row, record in table.items():
         part = record.of(targets, SETTLED)
         there = np.isfinite(part.nees)
         lost = _lost(part, targets).sum((1, 2))
         total = np.where(there.any((1, 2)), np.nansum(part.square, (1, 2)), REACH_M**2)
-        scores[f"{row}/position_rmse_m"] = np.sqrt(total / np.maximum(there.sum((1, 2)), 1))
-        scores[f"{row}/lost_1"] = lost / (there.sum((1, 2)) + lost)
-    return scores
+        columns[f"{row}/position_rmse_m"] = np.sqrt(total / np.maximum(there.sum((1, 2)), 1))
+        columns[f"{row}/lost_1"] = lost / (there.sum((1, 2)) + lost)
+    return columns
 
 
 def _needs(quantity: str, *rows: str) -> tuple[str, ...]:
@@ -288,5 +283,5 @@ SCENARIO = Scenario(
     scene=scene,
     judge=judge,
     rules=RULE_CHOICES,
-    compare=compare,
+    scores=scores,
 )

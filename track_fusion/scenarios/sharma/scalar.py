@@ -18,7 +18,7 @@ from track_fusion.rules.inverse_covariance_intersection import InverseCovariance
 from track_fusion.scenarios.sharma import PAPER
 from track_fusion.study.chart import Chart, Series, bars
 from track_fusion.study.rows import Outcomes, Progress, chosen, row_by_row
-from track_fusion.study.rule_choice import RuleChoice, compare_each, fuse_runs
+from track_fusion.study.rule_choice import RuleChoice, fuse_runs, rule_by_rule
 from track_fusion.study.scenario import Claim, Scenario
 
 STEPS = 100
@@ -209,13 +209,8 @@ def _bars(outcomes: Outcomes) -> list[Chart]:
     return [bars("HMD-GA: squared error over the claimed variance", "NEES", values, "consistent")] if values else []
 
 
-def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
-    """Run any rules in every setting: root of the squared error averaged over the steps, (R,).
-
-    Raises
-    ------
-    ParameterError    a rule needs more than the two tracks
-    """
+def scores(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
+    """Run any rules in every setting: root of the squared error averaged over the steps, (R,)."""
     normals = _normals(runs, seed)
 
     def measure(choice: RuleChoice) -> Outcomes:
@@ -225,7 +220,7 @@ def compare(rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progres
             errors[f"rmse_{setting.name}_1"] = np.sqrt(track(setting, choice, normals, rngs).square.mean(1))
         return errors
 
-    return compare_each("kf", rules, progress, measure)
+    return rule_by_rule("kf", rules, progress, measure)
 
 
 def _names(row: str, quantity: str) -> tuple[str, ...]:
@@ -303,5 +298,5 @@ SCENARIO = Scenario(
     claims=CLAIMS,
     piece=50,
     rules=RULE_CHOICES,
-    compare=compare,
+    scores=scores,
 )
