@@ -129,7 +129,7 @@ def fused_row(tracking: Tracking, filters: Filters, choice: RuleChoice, join: bo
 
         def fuse(states: Sequence[TrackState]) -> tuple[FusedTracks, Density]:
             means, covs = (np.stack(part, 1) for part in zip(*(_moments(tracking, s) for s in states), strict=True))
-            tracks = fuse_runs(choice, means, covs, rngs, float(states[0].dof))
+            tracks = fuse_runs(choice, means, covs, rngs, float(states[0].dof), tracking.layout.periods)
             if not join:
                 return tracks, Gaussian(tracks.mean, tracks.cov)
             assert tracks.weights is not None
