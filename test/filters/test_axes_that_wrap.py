@@ -19,7 +19,7 @@ from track_fusion.filters.square_root_cubature import SquareRootCubature
 from track_fusion.filters.student_t import StudentT
 from track_fusion.filters.unscented import Unscented, UnscentedParams
 from track_fusion.models.constant_turn_rate_and_speed import ConstantTurnRateAndSpeed, TurnRateAndSpeedParams
-from track_fusion.models.measurement import LinearSensor
+from track_fusion.models.measurement import LinearSensor, RangeBearingSensor
 from track_fusion.tracks import StateLayout
 
 LAYOUT = StateLayout(("x", "y", "yaw", "speed", "turn_rate"))
@@ -125,3 +125,20 @@ def test_wide_particles_at_the_seam_have_the_moments_of_those_at_zero_turned(deg
     wanted = direction + (weight * gap).sum(-1)
     np.testing.assert_allclose(difference(here[0][:, 1], wanted, TURN), 0.0, atol=1e-12)
     np.testing.assert_allclose(here[1][:, 1, 1], (weight * gap**2).sum(-1) - (weight * gap).sum(-1) ** 2, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", SIGMA)
+def test_a_bearing_that_the_prior_does_not_bound_is_refused(name: str) -> None:
+    """Around the sensor bearings have no mean; beside it they have, on whichever side of the seam."""
+    layout = StateLayout(("x", "y"))
+    sensor, cov = RangeBearingSensor(layout, 5.0, 0.05), np.diag([900.0, 1e4])
+    z = np.array([100.0, 3.0])
+    for x in (0.0, -20.0):
+        with pytest.raises(np.linalg.LinAlgError, match="no mean direction"):
+            Plain(FILTERS[name]).update(np.array([x, 0.0]), cov, z, sensor)
+    left, left_cov, _ = Plain(FILTERS[name]).update(np.array([-200.0, 0.0]), cov, np.array([210.0, 3.1]), sensor)
+    right, right_cov, _ = Plain(FILTERS[name]).update(
+        np.array([200.0, 0.0]), cov, np.array([210.0, 3.1 - np.pi]), sensor
+    )
+    np.testing.assert_allclose(left, -right, atol=1e-9)
+    np.testing.assert_allclose(left_cov, right_cov, atol=1e-8)

@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
+from track_fusion.angles import OPPOSITE, within_half_circle
 from track_fusion.filters.base import Gaussian, GaussianFilter, Innovation
 from track_fusion.linalg import Array, cholesky, mahalanobis_squared, matvec, solve, symmetrise, transpose
 from track_fusion.models.base import Sensor, Transition
@@ -53,13 +54,28 @@ def unrolled(mean: Array, sigma: Array, reference: Array, sensor: Sensor) -> Arr
     The short way round may be the wrong one for an axis of the state itself: where a difference was wrapped, it is
     summed over two steps, to the point halfway and from there. So a direction whose standard deviation is 90 degrees
     is measured as if it did not wrap, up to points a whole turn away.
+
+    Raises
+    ------
+    LinAlgError    measured directions, other than axes of the state, lie beyond a half circle: the points surround
+                   the sensor
     """
     seen = sensor.observe(sigma)
     turned = sensor.residual(seen, reference[..., None, :])
     if np.array_equal(turned, seen - reference[..., None, :]):
-        return turned
-    halfway = sensor.observe(0.5 * (sigma + mean[..., None, :]))
-    return sensor.residual(halfway, reference[..., None, :]) + sensor.residual(seen, halfway)
+        unwrapped = turned
+    else:
+        halfway = sensor.observe(0.5 * (sigma + mean[..., None, :]))
+        unwrapped = sensor.residual(halfway, reference[..., None, :]) + sensor.residual(seen, halfway)
+    beyond = ~within_half_circle(unwrapped, sensor.periods)
+    if beyond.any():
+        straight = (sigma - mean[..., None, :]) @ transpose(sensor.jacobian(mean))
+        bent = np.isfinite(sensor.periods) & (np.abs(unwrapped - straight) > OPPOSITE)
+        if (beyond & bent.any((-2, -1))).any():
+            raise np.linalg.LinAlgError(
+                "The sigma points surround the sensor: what they measure has no mean direction."
+            )
+    return unwrapped
 
 
 class SigmaPointFilter(GaussianFilter, ABC):

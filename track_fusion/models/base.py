@@ -85,6 +85,10 @@ class Sensor(Protocol):
     def noise(self) -> Array:
         """R, (m, m), squared SI units."""
 
+    @property
+    def periods(self) -> tuple[float, ...]:
+        """Periods of the axes of a detection that wrap, infinite for the others, (m,)."""
+
     def observe(self, state: Array) -> Array:
         """Return h(x), (..., n) -> (..., m)."""
 

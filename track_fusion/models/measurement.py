@@ -148,6 +148,7 @@ class RangeRangeRateSensor:
     """
 
     axes = ("range", "range_rate")
+    periods = (np.inf, np.inf)
 
     def __init__(
         self,

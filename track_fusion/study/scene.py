@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from track_fusion.angles import wrap
 from track_fusion.linalg import Array, matvec
 from track_fusion.models.base import Motion, Sensor
 from track_fusion.models.noise import Noise
@@ -118,5 +119,5 @@ class Tracking:
             factor = np.linalg.cholesky(sensor.noise)
             draws = self.measurement_noise.draw(seed, run, name, len(truth) - 1, len(factor))
             z = sensor.observe(truth[1:]) + draws @ factor.T
-            seen[name] = sensor.residual(z, np.zeros_like(z))  # angles wrapped
+            seen[name] = wrap(z, sensor.periods)
         return seen
