@@ -6,7 +6,7 @@ import numpy as np
 
 from track_fusion.angles import wrap
 from track_fusion.filters.base import Gaussian, GaussianFilter, Innovation
-from track_fusion.linalg import Array, mahalanobis_squared, matvec, solve, symmetrise, transpose
+from track_fusion.linalg import Array, matvec, solve, symmetrise, transpose
 from track_fusion.models.base import Transition
 from track_fusion.models.measurement import LinearSensor
 
@@ -29,8 +29,7 @@ def condition(state: Gaussian, z: Array, slope: Array, noise: Array) -> tuple[Ga
     residual = z - matvec(slope, state.mean)
     gain, spread = linear_gain(state.cov, slope, noise)
     posterior = symmetrise(joseph(state.cov, gain, slope, noise))
-    innovation = Innovation(residual, spread, mahalanobis_squared(residual, spread))
-    return Gaussian(state.mean + matvec(gain, residual), posterior, state.dof), innovation
+    return Gaussian(state.mean + matvec(gain, residual), posterior, state.dof), Innovation(residual, spread)
 
 
 class Kalman(GaussianFilter):

@@ -9,7 +9,7 @@ import numpy as np
 
 from track_fusion.angles import OPPOSITE, within_half_circle
 from track_fusion.filters.base import Gaussian, GaussianFilter, Innovation
-from track_fusion.linalg import Array, cholesky, mahalanobis_squared, matvec, solve, symmetrise, transpose
+from track_fusion.linalg import Array, cholesky, matvec, solve, symmetrise, transpose
 from track_fusion.models.base import Sensor, Transition
 
 
@@ -122,5 +122,4 @@ class SigmaPointFilter(GaussianFilter, ABC):
         left = offset - seen @ transpose(gain)
         posterior = symmetrise(points.cross(left, left) + gain @ sensor.noise @ transpose(gain))
         residual = sensor.residual(z, expected)
-        innovation = Innovation(residual, spread, mahalanobis_squared(residual, spread))
-        return Gaussian(mean + matvec(gain, residual), posterior, state.dof), innovation
+        return Gaussian(mean + matvec(gain, residual), posterior, state.dof), Innovation(residual, spread)
