@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from filters.plain import Plain, predict, update
 
-from track_fusion.angles import TURN, difference
 from track_fusion.filters import particle
 from track_fusion.filters.cubature import Cubature
 from track_fusion.filters.extended import Extended
@@ -12,7 +11,6 @@ from track_fusion.filters.particle import SirParams
 from track_fusion.filters.student_t import StudentT, StudentTParams
 from track_fusion.filters.unscented import Unscented
 from track_fusion.models.choices import SENSORS, LinearParams, make
-from track_fusion.models.constant_turn_rate_and_speed import ConstantTurnRateAndSpeed, TurnRateAndSpeedParams
 from track_fusion.models.measurement import LinearSensor, RangeBearingSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
@@ -20,7 +18,7 @@ from track_fusion.params import ParameterError, Params
 from track_fusion.random_streams import stream
 from track_fusion.trackers.filters import FILTERS
 from track_fusion.trackers.one_target import LostTrackError, SensorTracker, SensorTrackerParams
-from track_fusion.tracks import COASTED, CONFIRMED, SECOND_NS, StateLayout, TrackBatch, planar_layout
+from track_fusion.tracks import COASTED, CONFIRMED, StateLayout, TrackBatch, planar_layout
 
 SECOND = 10**9
 LAYOUT = planar_layout()
@@ -410,21 +408,3 @@ def test_a_lost_track_that_detections_cannot_start_goes_back_to_its_initial_stat
     found = list(steps(own, (1, (3.0, 4.0), None), (2, (9e11, 0.0), 1e-20), (3, (9e11, 0.0), 1e-20)))
     assert (found[0], found[-1]) == ("good", "lost_track")
     assert own.time_ns == 0
-
-
-@pytest.mark.parametrize("name", ["extended", "unscented", "cubature", "particle", "student_t"])
-def test_a_target_that_turns_is_published_between_minus_pi_and_pi(name):
-    """Three rounds with a compass: filters hold the yaw unrolled, tracks do not."""
-    layout = StateLayout(("x", "y", "yaw", "speed", "turn_rate"))
-    motion = ConstantTurnRateAndSpeed(layout, TurnRateAndSpeedParams())
-    sensor = LinearSensor.reading(layout, ("x", "y", "yaw"), 1e-2 * np.eye(3))
-    choice = FILTERS[name]
-    params = SensorTrackerParams(initial_mean=(0.0, 0.0, 0.0, 1.0, 0.5), initial_cov=(0.01,) * 5)
-    tracker = SensorTracker(motion, sensor, choice.make(motion, sensor, choice.params()), "map", params)
-    for k in range(1, 40):
-        yaw = 0.5 * k
-        place = [2.0 * np.sin(yaw), 2.0 - 2.0 * np.cos(yaw)]
-        track = tracker.step(k * SECOND_NS, np.array([[*place, difference(yaw, 0.0, TURN)]]), None)
-        assert (np.abs(track.mean[..., 2]) <= np.pi).all()
-        assert abs(difference(track.moments[0][0, 2], yaw, TURN)) < 0.2
-        assert track.moments[1][0, 2, 2] < 0.05
