@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from msg_adapters.arrays import merged
 from msg_adapters.odometry import odometry_from_msg
 from msg_adapters.track_table import track_table_from_msg
 from track_fusion.bags.read import read_bag
 from track_fusion.demo.plan import Demo
 from track_fusion.demo.wiring import FUSED, TRUTH
 from track_fusion.report.picture import Line, draw, draw_map
+from track_fusion.tracks import TrackBatch
 
 #: Of the sensors, and last of what is fused.
 COLORS = ("tab:blue", "tab:orange", "tab:green", "tab:purple", "tab:red")
@@ -25,7 +25,7 @@ def picture(demo: Demo) -> None:
     states = np.array([odometry_from_msg(m, axes).tracks.mean[0, 0, at] for m in messages[TRUTH]])
     lines = []
     for name, topic in topics.items():
-        moments = [merged(track_table_from_msg(m), axes) for m in messages[topic]]
+        moments = [TrackBatch(layout=layout, **track_table_from_msg(m).columns).moments for m in messages[topic]]
         mean = np.concatenate([m[:, at] for m, _ in moments])
         cov = np.concatenate([c[:, at][..., at] for _, c in moments])
         label = f"fused: {demo.rules[-1].replace('_', ' ')}" if name == "fused" else name.replace("_", " ")

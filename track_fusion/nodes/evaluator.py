@@ -19,7 +19,6 @@ from track_fusion.nodes.process import end, run
 from track_fusion.nodes.ros_params import declare
 from track_fusion.nodes.screening import FrameParams, screened_tracks
 from track_fusion.params import Params, param
-from track_fusion.tracks import StateLayout
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +35,7 @@ class EvaluatorNode(ManagedNode):
     def declare_parameters_(self) -> None:
         """Declare parameters."""
         self.frame, self.params = declare(self, FrameParams), declare(self, EvaluatorParams)
-        self.layout = StateLayout(self.frame.axes)
+        self.layout = self.frame.layout
         self._evaluation_params = declare(self, EvaluationParams)
         self.finished = False
         self.on_clock_jump()
