@@ -104,12 +104,13 @@ def test_the_seed_reaches_all_who_draw() -> None:
 
 
 def test_without_arguments_the_parameter_file_decides() -> None:
-    assert overrides(SCENARIO) == {}
+    assert overrides(SCENARIO) == {"fusion_centre": {"covariance_intersection.criterion": "trace"}}
 
 
 def test_the_demo_runs_in_lockstep_with_the_rule_asked_for() -> None:
     given = overrides(DEMO, rule="arithmetic_average")
-    assert given == {"fusion_centre": {"state_fusion": "arithmetic_average"}, "replay": {"pace": "lockstep"}}
+    own = {"arithmetic_average.criterion": "diversity"}
+    assert given == {"fusion_centre": {"state_fusion": "arithmetic_average", **own}, "replay": {"pace": "lockstep"}}
 
 
 def test_an_unknown_scenario_is_refused_with_those_there_are() -> None:

@@ -184,7 +184,9 @@ class Evaluation:
             self._answered.discard(stamp_ns)
 
     def _close(self, stamp_ns: int) -> None:
-        judged = self._judgement(stamp_ns)
+        judged = self._judged.get(stamp_ns)
+        if judged is None or judged.truth is None or not judged.truth.exact:
+            judged = self._judgement(stamp_ns)
         self._closed.add(judged)
         if judged.truth is not None and self._truth.has(stamp_ns):
             self._answered.add(stamp_ns)
