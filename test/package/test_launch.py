@@ -100,7 +100,9 @@ def test_arguments_reach_the_nodes_that_own_them_with_their_types() -> None:
 
 def test_the_seed_reaches_all_who_draw() -> None:
     given = overrides(SCENARIO, scenario="li2022-nonlinear-sir", seed="7")
-    assert given == {name: {"seed": 7} for name in ("replay", "fusion_centre", "sensor_1", "sensor_2")}
+    seeded = {name: {"seed": 7} for name in ("replay", "sensor_1", "sensor_2")}
+    own = {"arithmetic_average.criterion": "diversity", "arithmetic_average.output": "mixture"}
+    assert given == {**seeded, "fusion_centre": {"seed": 7, **own}}
 
 
 def test_without_arguments_the_parameter_file_decides() -> None:
