@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from msg_adapters.arrays import merged
-from msg_adapters.odometry import odometry_from_msg
 from msg_adapters.track_table import track_table_from_msg
 from track_fusion.bags.read import read_bag
 from track_fusion.demo.plan import Demo
@@ -22,7 +21,7 @@ def picture(demo: Demo) -> None:
     axes, at = layout.axes, list(layout.position)
     topics = {**{s: f"/{s}/tracks" for s in sensors}, "fused": FUSED}
     messages = read_bag(demo.out / "bag", (TRUTH, *topics.values()))
-    states = np.array([odometry_from_msg(m, axes).tracks.mean[0, 0, at] for m in messages[TRUTH]])
+    states = np.concatenate([merged(track_table_from_msg(m), axes)[0][:, at] for m in messages[TRUTH]])
     lines = []
     for name, topic in topics.items():
         moments = [merged(track_table_from_msg(m), axes) for m in messages[topic]]

@@ -109,7 +109,7 @@ class Bringup:
         remaps["replay"] = {"~/fused": result}
         alone: Overrides = {} if fused else {"replay": {"sensors": list(sensors)}, sensors[0]: {"feedback": "none"}}
         centre = {**self.sections["fusion_centre"], **overrides.get("fusion_centre", {})}
-        given = {"fusion_centre": self.of_rule.get(centre["state_fusion"], {}), **alone}
+        given = {"fusion_centre": self.of_rule.get(centre.get("state_fusion"), {}), **alone}
         draw = {key: value for key, value in overrides.get("replay", {}).items() if key in _DRAW}
 
         def spec(name: str) -> NodeSpec:
