@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import pytest
 from ros_helpers import own_domain
 
@@ -18,7 +19,11 @@ ROOT = Path(__file__).resolve().parent.parent
 # Domains up to 101 keep Fast DDS's ports below the range from which Linux hands out ephemeral ones; 0 is the users'.
 DOMAINS = range(1, 102)
 # What is tested in these folders no version of NumPy or SciPy changes: texts, processes, packaging.
-ONCE = frozenset({"bags", "cli", "nodes", "package", "plugins", "tools"})
+ONCE = frozenset({"bags", "cli", "nodes", "package", "tools"})
+
+# How long an example takes tells of the machine's other work only.
+hypothesis.settings.register_profile("unhurried", deadline=None)
+hypothesis.settings.load_profile("unhurried")
 
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"

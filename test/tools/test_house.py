@@ -20,7 +20,6 @@ BESIDE = {
     "adapters": "msg_adapters",
     "data": "files that tests read",
     "oracles": "computations that share no code with what they judge",
-    "plugins": "packages that bring rules, motions and messages of their own, in processes",
     "package": "setup.py, package.xml, launch files, what is installed",
     "tools": "tools/",
 }

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cached_property
 from typing import Protocol, TypeVar
 
 import numpy as np
 
 from track_fusion.densities.mixture.mixture import Mixture
-from track_fusion.linalg import Array, logdet
+from track_fusion.linalg import Array, logdet, mahalanobis_squared
 
 S = TypeVar("S")
 #: How the target moves over an interval: a Transition, or one for each mode.
@@ -77,11 +78,15 @@ class Evidence:
 
 @dataclasses.dataclass(frozen=True)
 class Innovation:
-    """What an update learned: residual (..., m), its covariance (..., m, m), NIS and log-likelihood (...)."""
+    """What an update learned: residual (..., m) and its covariance (..., m, m); of them, when asked for, the rest."""
 
     residual: Array
     cov: Array
-    nis: Array
+
+    @cached_property
+    def nis(self) -> Array:
+        """Normalised innovation squared r' S^-1 r, (...)."""
+        return mahalanobis_squared(self.residual, self.cov)
 
     @property
     def log_likelihood(self) -> Array:

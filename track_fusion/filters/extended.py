@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from track_fusion.filters.base import Gaussian, GaussianFilter, Innovation
 from track_fusion.filters.kalman import condition
-from track_fusion.linalg import Array, symmetrise, transpose
+from track_fusion.linalg import Array, matvec, symmetrise, transpose
 from track_fusion.models.base import Sensor, Transition
 
 
@@ -39,5 +39,7 @@ class Extended(Linearising):
         z : (..., m)
         sensor : Sensor
         """
-        residual = sensor.residual(z, sensor.observe(state.mean))
-        return condition(state, residual, sensor.jacobian(state.mean), sensor.noise)
+        slope = sensor.jacobian(state.mean)
+        # The linear filter sees the measurement whose linearised residual is the true, wrapped one.
+        equivalent = matvec(slope, state.mean) + sensor.residual(z, sensor.observe(state.mean))
+        return condition(state, equivalent, slope, sensor.noise)

@@ -94,8 +94,9 @@ class GaussianStudentTMixture(Linearising):
         residual = sensor.residual(z, sensor.observe(mean))
         lead, (n, m) = np.broadcast_shapes(mean.shape[:-1], z.shape[:-1]), (mean.shape[-1], z.shape[-1])
         shapes = (n, n), (m,), (m, n), (m, m)
-        nominal = scatter_from_cov(state.cov, state.dof), scatter_from_cov(sensor.noise, state.dof)
-        parts = (nominal[0], residual, sensor.jacobian(mean), nominal[1])
+        # As scatter_from_cov, but in an order that gives whole numbers back: nominal noises of t(3) are such.
+        noise = sensor.noise - sensor.noise * (2.0 / np.asarray(state.dof))[..., None, None]
+        parts = (scatter_from_cov(state.cov, state.dof), residual, sensor.jacobian(mean), noise)
         whole = _Update(*(np.broadcast_to(a, (*lead, *s)).reshape(-1, *s) for a, s in zip(parts, shapes, strict=True)))
         share, weight, converged, iterations = _ascend(whole, self.params)
         precision = share + (1.0 - share) * weight

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from track_fusion.filters.base import Gaussian, GaussianFilter, Innovation
-from track_fusion.linalg import Array, mahalanobis_squared, matvec, solve, symmetrise, transpose
+from track_fusion.linalg import Array, matvec, solve, symmetrise, transpose
 from track_fusion.models.base import Transition
 from track_fusion.models.measurement import LinearSensor
 
@@ -23,12 +23,12 @@ def joseph(cov: Array, gain: Array, slope: Array, noise: Array) -> Array:
     return np.asarray(keep @ cov @ transpose(keep) + gain @ noise @ transpose(gain))
 
 
-def condition(state: Gaussian, residual: Array, slope: Array, noise: Array) -> tuple[Gaussian, Innovation]:
-    """Condition on the residual z - h(x) (..., m) of a sensor of slope H (..., m, n) and noise R (..., m, m)."""
+def condition(state: Gaussian, z: Array, slope: Array, noise: Array) -> tuple[Gaussian, Innovation]:
+    """Condition on z = H x + v (..., m) of a sensor of slope H (..., m, n) and noise R (..., m, m)."""
+    residual = z - matvec(slope, state.mean)
     gain, spread = linear_gain(state.cov, slope, noise)
     posterior = symmetrise(joseph(state.cov, gain, slope, noise))
-    innovation = Innovation(residual, spread, mahalanobis_squared(residual, spread))
-    return Gaussian(state.mean + matvec(gain, residual), posterior, state.dof), innovation
+    return Gaussian(state.mean + matvec(gain, residual), posterior, state.dof), Innovation(residual, spread)
 
 
 class Kalman(GaussianFilter):
@@ -63,4 +63,4 @@ class Kalman(GaussianFilter):
         z : (..., m)
         sensor : LinearSensor    H (m, n), or one for each state (..., m, n), and R
         """
-        return condition(state, z - matvec(sensor.matrix, state.mean), sensor.matrix, sensor.noise)
+        return condition(state, z, sensor.matrix, sensor.noise)

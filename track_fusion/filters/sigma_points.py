@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 import numpy as np
 
 from track_fusion.filters.base import Gaussian, GaussianFilter, Innovation
-from track_fusion.linalg import Array, cholesky, mahalanobis_squared, matvec, solve, symmetrise, transpose
+from track_fusion.linalg import Array, cholesky, matvec, solve, symmetrise, transpose
 from track_fusion.models.base import Sensor, Transition
 
 
@@ -91,5 +91,4 @@ class SigmaPointFilter(GaussianFilter, ABC):
         left = offset - seen @ transpose(gain)
         posterior = symmetrise(points.cross(left, left) + gain @ sensor.noise @ transpose(gain))
         residual = sensor.residual(z, expected)
-        innovation = Innovation(residual, spread, mahalanobis_squared(residual, spread))
-        return Gaussian(mean + matvec(gain, residual), posterior, state.dof), innovation
+        return Gaussian(mean + matvec(gain, residual), posterior, state.dof), Innovation(residual, spread)

@@ -97,5 +97,5 @@ class SquareRootCubature:
         spread_root, cross, left = joint[..., :m, :m], joint[..., m:, :m], joint[..., m:, m:]
         residual = sensor.residual(z, expected)
         white = solve(spread_root, residual[..., None])[..., 0]
-        innovation = Innovation(residual, symmetrise(spread_root @ transpose(spread_root)), (white**2).sum(-1))
-        return GaussianRoot(mean + matvec(cross, white), left), innovation
+        spread = symmetrise(spread_root @ transpose(spread_root))
+        return GaussianRoot(mean + matvec(cross, white), left), Innovation(residual, spread)

@@ -81,8 +81,8 @@ def _optimal(mean: Array, cov: Array, criterion: str) -> Fusion:
     if len(mean) <= size:
         return kernel(mean, cov, criterion)
     parts = [kernel(mean[i : i + size], cov[i : i + size], criterion) for i in range(0, len(mean), size)]
-    means, covs, found = zip(*parts, strict=True)
-    return np.concatenate(means), np.concatenate(covs), Solution.concatenate(found)
+    means, covs, search = zip(*parts, strict=True)
+    return np.concatenate(means), np.concatenate(covs), Solution.concatenate(search)
 
 
 def _fuse_pairs(mean: Array, cov: Array, criterion: str) -> Fusion:
@@ -91,8 +91,8 @@ def _fuse_pairs(mean: Array, cov: Array, criterion: str) -> Fusion:
         return _fuse_few(mean, cov, criterion)
     first_mean, second_mean, first, second = mean[:, 0], mean[:, 1], cov[:, 0], cov[:, 1]
     pair = Pair.of(first, second)
-    found = minimise_on_interval(_pair_derivatives(pair, criterion), len(mean))
-    omega = found.weights
+    search = minimise_on_interval(_pair_derivatives(pair, criterion), len(mean))
+    omega = search.weights
     # With P1 + P2 = 1, (w / P1 + (1 - w) / P2)^-1 = P1 P2 / (w P2 + (1 - w) P1).
     share = omega * pair.second
     total = share + (1.0 - omega) * pair.first
@@ -105,8 +105,12 @@ def _fuse_pairs(mean: Array, cov: Array, criterion: str) -> Fusion:
     if delicate.any():
         rows = np.flatnonzero(delicate)
         fused_mean[rows], fused_cov[rows], exact = _fuse_delicate(mean[rows], cov[rows], criterion)
-        weights[rows], found.converged[rows], found.iterations[rows] = exact.weights, exact.converged, exact.iterations
-    return fused_mean, fused_cov, Solution(weights, found.converged, found.iterations)
+        weights[rows], search.converged[rows], search.iterations[rows] = (
+            exact.weights,
+            exact.converged,
+            exact.iterations,
+        )
+    return fused_mean, fused_cov, Solution(weights, search.converged, search.iterations)
 
 
 def _fuse_few(mean: Array, cov: Array, criterion: str) -> Fusion:
@@ -117,8 +121,8 @@ def _fuse_few(mean: Array, cov: Array, criterion: str) -> Fusion:
     ]
     if len(parts) == 1:
         return parts[0]
-    means, covs, found = zip(*parts, strict=True)
-    return np.concatenate(means), np.concatenate(covs), Solution.concatenate(found)
+    means, covs, search = zip(*parts, strict=True)
+    return np.concatenate(means), np.concatenate(covs), Solution.concatenate(search)
 
 
 def _fuse_one(mean: Array, cov: Array, criterion: str) -> Fusion | None:
@@ -127,17 +131,17 @@ def _fuse_one(mean: Array, cov: Array, criterion: str) -> Fusion | None:
     if pair is None:
         return None
     omega, converged, iterations = minimise_one(_single_derivatives(pair, criterion))
-    found = Solution(np.array([[omega, 1.0 - omega]]), np.array([converged]), np.array([iterations]))
+    search = Solution(np.array([[omega, 1.0 - omega]]), np.array([converged]), np.array([iterations]))
     if omega in (0.0, 1.0):
         source = 0 if omega == 1.0 else 1
-        return mean[source][None].copy(), cov[source][None].copy(), found
+        return mean[source][None].copy(), cov[source][None].copy(), search
     if omega * (1.0 - omega) < NEAR_END:
         return None
     totals = [omega * q + (1.0 - omega) * p for p, q in zip(pair.first, pair.second, strict=True)]
     gain = np.array([omega * q / t for q, t in zip(pair.second, totals, strict=True)])
     pull = pair.basis @ (gain * (pair.inverse @ (mean[0] - mean[1])))
     fused = pair.rebuild([p * q / t for p, q, t in zip(pair.first, pair.second, totals, strict=True)])
-    return (mean[1] + pull)[None], fused[None], found
+    return (mean[1] + pull)[None], fused[None], search
 
 
 #: So close to 0 or 1 the weight's own digits, not the pair's, decide: use the information form.
@@ -209,9 +213,9 @@ def _fuse_delicate(mean: Array, cov: Array, criterion: str) -> Fusion:
         loss = (step @ fused) * outer(scale[rows])
         return -_trace(loss), 2.0 * _trace((step @ step @ fused) * outer(scale[rows]))
 
-    found = minimise_on_interval(derivatives, len(mean))
-    weights = np.stack([found.weights, 1.0 - found.weights], -1)
-    return *weighted_product(mean, cov, weights), Solution(weights, found.converged, found.iterations)
+    search = minimise_on_interval(derivatives, len(mean))
+    weights = np.stack([search.weights, 1.0 - search.weights], -1)
+    return *weighted_product(mean, cov, weights), Solution(weights, search.converged, search.iterations)
 
 
 def _fuse_many(mean: Array, cov: Array, criterion: str) -> Fusion:
@@ -238,14 +242,14 @@ def _fuse_many(mean: Array, cov: Array, criterion: str) -> Fusion:
         hessian = part_flat @ transpose(image)
         return gradient, hessian if units is None else hessian + transpose(hessian)
 
-    found = minimise_on_simplex(gradient_hessian, batch, count)
-    fused = fused_at(found.weights, flat)
+    search = minimise_on_simplex(gradient_hessian, batch, count)
+    fused = fused_at(search.weights, flat)
     origin = mean[:, :1]
-    pull = (found.weights[..., None] * matvec(info, matvec(whiten[:, None], mean - origin))).sum(1)
+    pull = (search.weights[..., None] * matvec(info, matvec(whiten[:, None], mean - origin))).sum(1)
     fused_mean = origin[:, 0] + matvec(lower, matvec(fused, pull))
     fused_cov = symmetrise(lower @ fused @ transpose(lower))
-    keep_sole(fused_mean, fused_cov, mean, cov, found.weights)
-    return fused_mean, fused_cov, found
+    keep_sole(fused_mean, fused_cov, mean, cov, search.weights)
+    return fused_mean, fused_cov, search
 
 
 def _whitened_units(lower: Array, info: Array) -> Array:

@@ -215,11 +215,11 @@ def _prepared(problem: Problem, params: MixtureExactParams) -> tuple[Quotient, B
 
 
 def _dls(problem: Problem, params: MixtureExactParams, rng: np.random.Generator) -> Result:
-    quotient, bound, found, info = _prepared(problem, params)
-    kept = prune_mixands(quotient, bound.log_weight, found.log_moment, params.prune_nats)
+    quotient, bound, modes, info = _prepared(problem, params)
+    kept = prune_mixands(quotient, bound.log_weight, modes.log_moment, params.prune_nats)
 
     def approximate() -> Laplace:
-        return Laplace(*(take_components(a, kept.order) for a in found))
+        return Laplace(*(take_components(a, kept.order) for a in modes))
 
     def wide(near: Laplace) -> Array:
         """Covariances of the Gaussians above the mixands; where there is none, the widest that heavy tails allow."""
@@ -231,18 +231,18 @@ def _dls(problem: Problem, params: MixtureExactParams, rng: np.random.Generator)
 
 
 def _igs(problem: Problem, params: MixtureExactParams, rng: np.random.Generator) -> Result:
-    quotient, _, found, info = _prepared(problem, params)
-    proposal = laplace_proposal(found, params.inflation)
+    quotient, _, modes, info = _prepared(problem, params)
+    proposal = laplace_proposal(modes, params.inflation)
     result = indirect_global_sampling(quotient, proposal, rng, params.samples)
     ess = result.samples.ess / params.samples
     return result.mixture, info | {"ess": ess, "log_eta": result.samples.log_eta}
 
 
 def _laplace(problem: Problem, params: MixtureExactParams, rng: np.random.Generator) -> Result:
-    _, _, found, info = _prepared(problem, params)
-    good = found.converged | ~np.isfinite(found.log_moment) | problem.exempt[..., None]
-    info |= {"converged": np.asarray(good.all(-1)), "log_eta": log_sum_exp(found.log_moment)}
-    return Mixture(normalised(found.log_moment), found.mean, found.cov), info
+    _, _, modes, info = _prepared(problem, params)
+    good = modes.converged | ~np.isfinite(modes.log_moment) | problem.exempt[..., None]
+    info |= {"converged": np.asarray(good.all(-1)), "log_eta": log_sum_exp(modes.log_moment)}
+    return Mixture(normalised(modes.log_moment), modes.mean, modes.cov), info
 
 
 def _mmgd(problem: Problem, params: MixtureExactParams, rng: np.random.Generator) -> Result:

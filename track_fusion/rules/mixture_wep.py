@@ -165,33 +165,33 @@ Result = tuple[Mixture, dict[str, NDArray[Any]]]
 Method = Callable[[Mixture, Mixture, Omega, MixtureWepParams, np.random.Generator], Result]
 
 
-def _dls(first: Mixture, second: Mixture, found: Omega, params: MixtureWepParams, rng: np.random.Generator) -> Result:
-    bound = wep_bound(first, second, found.omega)
+def _dls(first: Mixture, second: Mixture, search: Omega, params: MixtureWepParams, rng: np.random.Generator) -> Result:
+    bound = wep_bound(first, second, search.omega)
     # The mixands sum to the whole integral, of which Algorithm 1 has an estimate: one is no less than the mean.
-    likely = np.broadcast_to((found.samples.log_eta - np.log(bound.shape[-1]))[..., None], bound.shape)
-    kept = prune_mixands(wep_quotient(first, second, found.omega), bound, likely, params.prune_nats)
+    likely = np.broadcast_to((search.samples.log_eta - np.log(bound.shape[-1]))[..., None], bound.shape)
+    kept = prune_mixands(wep_quotient(first, second, search.omega), bound, likely, params.prune_nats)
 
     def wide(near: Laplace) -> Array:
-        above = first_order(first, second, found.omega).cov
+        above = first_order(first, second, search.omega).cov
         return np.take_along_axis(above, kept.order[..., None, None], -3)
 
     return sample_mixands(kept, first, second, lambda: laplace(kept.quotient), wide, params, rng)
 
 
-def _igs(first: Mixture, second: Mixture, found: Omega, params: MixtureWepParams, rng: np.random.Generator) -> Result:
-    return single_shot_em(found.samples, product(LogMixture.of(first), LogMixture.of(second))), {}
+def _igs(first: Mixture, second: Mixture, search: Omega, params: MixtureWepParams, rng: np.random.Generator) -> Result:
+    return single_shot_em(search.samples, product(LogMixture.of(first), LogMixture.of(second))), {}
 
 
-def _em(first: Mixture, second: Mixture, found: Omega, params: MixtureWepParams, rng: np.random.Generator) -> Result:
-    learned = weighted_em(found.samples, params.learned_count(first, second), rng)
-    return learned.mixture, {"converged": found.converged & learned.converged}
+def _em(first: Mixture, second: Mixture, search: Omega, params: MixtureWepParams, rng: np.random.Generator) -> Result:
+    learned = weighted_em(search.samples, params.learned_count(first, second), rng)
+    return learned.mixture, {"converged": search.converged & learned.converged}
 
 
-def _foci(first: Mixture, second: Mixture, found: Omega, params: MixtureWepParams, rng: np.random.Generator) -> Result:
-    return first_order(first, second, found.omega), {}
+def _foci(first: Mixture, second: Mixture, search: Omega, params: MixtureWepParams, rng: np.random.Generator) -> Result:
+    return first_order(first, second, search.omega), {}
 
 
-def _pcci(first: Mixture, second: Mixture, found: Omega, params: MixtureWepParams, rng: np.random.Generator) -> Result:
+def _pcci(first: Mixture, second: Mixture, search: Omega, params: MixtureWepParams, rng: np.random.Generator) -> Result:
     """Intersect each pair of components by itself, weights as in (17) with the exponents of the pair."""
     pairs = Mixture(*(_pairs(a, b) for a, b in zip(_fields(first), _fields(second), strict=True)))
     rule = covariance_intersection.RULE

@@ -78,15 +78,23 @@ class Row(NamedTuple):
 
 
 class Filters(NamedTuple):
-    """The filters of a row: makes that of a sensor, by its name; how many runs they work on at once (0: all)."""
+    """The filters of a row.
+
+    Attributes
+    ----------
+    of : callable    (draws, name of a sensor) -> its filter
+    alike : bool     all sensors have the same, which draws no random numbers
+    chunk : int      runs that they work on at once; 0: all
+    """
 
     of: Callable[[Draws, str], TrackFilter[Any, Transition, Array, Any, Any]]
+    alike: bool
     chunk: int = 0
 
 
 def same_filters(one: TrackFilter[Gaussian, Transition, Array, Any, Any]) -> Filters:
     """Give all sensors one filter, which draws no random numbers."""
-    return Filters(lambda draws, name: one)
+    return Filters(lambda draws, name: one, alike=True)
 
 
 def sir_filters(params: SirParams) -> Filters:
@@ -95,7 +103,7 @@ def sir_filters(params: SirParams) -> Filters:
     def of(draws: Draws, name: str) -> Sir:
         return Sir(dataclasses.replace(params, seed=draws.seed, role=f"sir {name}"), tuple(draws.runs))
 
-    return Filters(of, SIR_CHUNK)
+    return Filters(of, alike=False, chunk=SIR_CHUNK)
 
 
 def _start(tracking: Tracking, runs: int) -> tuple[Array, Array]:
@@ -125,23 +133,27 @@ def fused_row(tracking: Tracking, filters: Filters, choice: RuleChoice, join: bo
     """
 
     def estimates(draws: Draws) -> Iterator[FusedTracks]:
-        rngs = [stream(draws.seed, run, "fusion_centre") for run in draws.runs]  # for a rule that samples
+        rngs = [stream(draws.seed, run, "fusion_centre") for run in draws.runs] if choice.random else None
 
-        def fuse(states: Sequence[TrackState]) -> tuple[FusedTracks, Density]:
+        def fuse(tracks: Sequence[Sequence[TrackState]]) -> tuple[FusedTracks, Density]:
+            states = [state for each in tracks for state in each]
             means, covs = (np.stack(part, 1) for part in zip(*(_moments(tracking, s) for s in states), strict=True))
-            tracks = fuse_runs(choice, means, covs, rngs, float(states[0].dof))
+            fused = fuse_runs(choice, means, covs, rngs, float(states[0].dof))
             if not join:
-                return tracks, Gaussian(tracks.mean, tracks.cov)
-            assert tracks.weights is not None
-            return tracks, union([s for s in states if isinstance(s, Particles)], tracks.weights)
+                return fused, Gaussian(fused.mean, fused.cov)
+            assert fused.weights is not None
+            return fused, union([s for s in states if isinstance(s, Particles)], fused.weights)
 
+        names, every = list(tracking.sensors), list(tracking.sensors.values())
         start, transition = _start(tracking, len(draws.runs)), tracking.motion.over(tracking.dt_s)
-        ones = [filters.of(draws, name) for name in tracking.sensors]
+        groups = [slice(None)] if filters.alike else [slice(k, k + 1) for k in range(len(names))]
+        ones = [filters.of(draws, names[group][0]) for group in groups]
         trackers = [
-            BatchTracker(one, one.begin(*start), transition, sensor)
-            for one, sensor in zip(ones, tracking.sensors.values(), strict=True)
+            BatchTracker(one, one.begin(*start), transition, every[group])
+            for one, group in zip(ones, groups, strict=True)
         ]
-        return fusion_loop(trackers, ([(z[:, k],) for z in draws.seen] for k in range(tracking.steps)), fuse)
+        scans = ([[z[:, k] for z in draws.seen[group]] for group in groups] for k in range(tracking.steps))
+        return fusion_loop(trackers, scans, fuse)
 
     return Row(estimates, filters.chunk)
 

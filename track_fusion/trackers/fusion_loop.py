@@ -61,21 +61,26 @@ def filtered(one: Filter[S, M, Z, H, object], state: S, motion: M, scans: Iterab
 class BatchTracker(Generic[S, M, Z, H]):
     """Tracks one target in many Monte Carlo runs at once with a filter, step by step over equal intervals.
 
+    With several sensors it stands for as many trackers that hold one state, since each was fed the same: all update by
+    themselves, from one prediction.
+
     Parameters
     ----------
     one : TrackFilter
     state                   at the start, of all runs
     motion                  over each interval
-    sensor
+    sensors
     """
 
-    def __init__(self, one: TrackFilter[S, M, Z, H, object], state: S, motion: M, sensor: H) -> None:
-        self._filter, self._state, self._motion, self._sensor = one, state, motion, sensor
+    def __init__(self, one: TrackFilter[S, M, Z, H, object], state: S, motion: M, sensors: Sequence[H]) -> None:
+        self._filter, self._state, self._motion, self._sensors = one, state, motion, sensors
 
-    def step(self, z: Z) -> S:
-        """Predict one interval and update with what was seen in all runs, (R, m); return the state."""
-        (self._state,) = filtered(self._filter, self._state, self._motion, [z], self._sensor)
-        return self._state
+    def step(self, *zs: Z) -> list[S]:
+        """Predict one interval and update with what each sensor saw in all runs, (R, m); return the state by each."""
+        predicted = self._filter.predict(self._state, self._motion)
+        states = [self._filter.update(predicted, z, sensor)[0] for z, sensor in zip(zs, self._sensors, strict=True)]
+        self._state = states[0]  # of several, all go on from what is fed back
+        return states
 
     def feed_back(self, fused: Density) -> None:
         """Take the fused densities for one's own."""

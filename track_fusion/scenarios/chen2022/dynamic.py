@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -20,13 +21,7 @@ from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.noise import Noise
 from track_fusion.rules import FusedTracks
-from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
-from track_fusion.rules.fast_covariance_intersection import FastCovarianceIntersectionParams
-from track_fusion.rules.geodesic_projection import GeodesicProjectionParams
-from track_fusion.rules.mhdp_explicit import MhdpExplicitParams
-from track_fusion.rules.mhdp_iterative import MhdpIterativeParams
-from track_fusion.rules.quasi_minimal_manhattan import QuasiMinimalManhattanParams
-from track_fusion.scenarios.chen2022 import PAPER
+from track_fusion.scenarios.chen2022 import PAPER, choices
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.one_target import drawn, fused_row, same_filters
 from track_fusion.study.rows import Outcomes, Progress, chosen
@@ -85,18 +80,9 @@ FILTERS = {
 }
 
 #: The rules of Table 1 in its order, and MHDP-E with the criterion as printed.
-RULE_CHOICES = (
-    RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="det")),
-    RuleChoice("geodesic_projection", GeodesicProjectionParams()),
-    RuleChoice("fast_covariance_intersection", FastCovarianceIntersectionParams()),
-    RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="uniform"), "uniform"),
-    RuleChoice("quasi_minimal_manhattan", QuasiMinimalManhattanParams()),
-    RuleChoice("mhdp_explicit", MhdpExplicitParams()),
-    RuleChoice("mhdp_iterative", MhdpIterativeParams()),
-    RuleChoice("mhdp_explicit", MhdpExplicitParams(criterion="unsquared"), "unsquared"),
-)
-DCI, GP, FCI, KLA, QMMHD, MHDP_E, MHDP_I = (choice.name for choice in RULE_CHOICES[:7])
-TABLE_1_RULES = (DCI, GP, FCI, KLA, QMMHD, MHDP_E, MHDP_I)
+PRINTED = (choices.DCI, choices.GP, choices.FCI, choices.KLA, choices.QMMHD, choices.MHDP_E, choices.MHDP_I)
+RULE_CHOICES = (*PRINTED, choices.UNSQUARED)
+TABLE_1_RULES = DCI, GP, FCI, KLA, QMMHD, MHDP_E, MHDP_I = tuple(choice.name for choice in PRINTED)
 #: What the paper calls those that are compared with MHDP.
 SHORT = {DCI: "DCI", GP: "GP", FCI: "FCI", KLA: "KLA", QMMHD: "QMMHD"}
 FIGURE, EXCESS = "position_armse_m", "position_excess_m"
@@ -134,9 +120,9 @@ def fusions(base: Tracking, name: str, choice: RuleChoice, seed: int, runs: Sequ
 Row = tuple[str, RuleChoice]
 
 
-def rows(choices: Sequence[RuleChoice]) -> dict[str, Row]:
+def rows(rules: Sequence[RuleChoice]) -> dict[str, Row]:
     """Every rule with every filter."""
-    return {f"{name}-{choice.name}": (name, choice) for name in FILTERS for choice in choices}
+    return {f"{name}-{choice.name}": (name, choice) for name in FILTERS for choice in rules}
 
 
 def squared_errors(
@@ -152,11 +138,9 @@ def squared_errors(
     return squares
 
 
-def scores(
-    base: Tracking, choices: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress
-) -> Outcomes:
+def scores(base: Tracking, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Root of the time-averaged squared position error of each run, (R,), under any rules, with both filters."""
-    errors = squared_errors(base, rows(choices), runs, seed, progress)
+    errors = squared_errors(base, rows(rules), runs, seed, progress)
     return {f"{row}/position_rmse_m": np.sqrt(squares.mean(1)) for row, squares in errors.items()}
 
 
@@ -250,5 +234,5 @@ def scenario(key: str, title: str, base: Tracking, table: Mapping[str, Sequence[
         piece=50,
         tracking=base,
         rules=RULE_CHOICES,
-        scores=lambda choices, runs, seed, progress: scores(base, choices, runs, seed, progress),
+        scores=partial(scores, base),
     )

@@ -14,14 +14,9 @@ from track_fusion.densities.elliptical.rao import informative_barycenter, rao_di
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.rules import SourceTracks
-from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
-from track_fusion.rules.fast_covariance_intersection import FastCovarianceIntersectionParams
-from track_fusion.rules.geodesic_projection import GeodesicProjectionParams
-from track_fusion.rules.mhdp_explicit import MhdpExplicitParams
-from track_fusion.rules.mhdp_iterative import MhdpIterativeParams
-from track_fusion.rules.quasi_minimal_manhattan import QuasiMinimalManhattanParams
 from track_fusion.rules.shared.elliptical import EllipticalParams
 from track_fusion.scenarios.chen2022 import PAPER
+from track_fusion.scenarios.chen2022.choices import DCI, FCI, GP, KLA, MHDP_E, MHDP_I, QMMHD, UNSQUARED
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.rows import Outcomes, Progress, exact_rows
 from track_fusion.study.rule_choice import RuleChoice, rule_by_rule
@@ -92,17 +87,8 @@ SETTINGS = {
 #: Those of which the plane of means and scatters is drawn.
 DRAWN = ("t3", "gg1")
 
-RULE_CHOICES = (
-    RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="det")),
-    RuleChoice("fast_covariance_intersection", FastCovarianceIntersectionParams()),
-    RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="uniform"), "uniform"),
-    RuleChoice("geodesic_projection", GeodesicProjectionParams()),
-    RuleChoice("quasi_minimal_manhattan", QuasiMinimalManhattanParams()),
-    RuleChoice("mhdp_explicit", MhdpExplicitParams()),
-    RuleChoice("mhdp_iterative", MhdpIterativeParams()),
-    RuleChoice("mhdp_explicit", MhdpExplicitParams(criterion="unsquared"), "unsquared"),
-)
-OTHERS, MHDP_E, MHDP_I, UNSQUARED = RULE_CHOICES[:5], RULE_CHOICES[5], RULE_CHOICES[6], RULE_CHOICES[7]
+OTHERS = (DCI, FCI, KLA, GP, QMMHD)
+RULE_CHOICES = (*OTHERS, MHDP_E, MHDP_I, UNSQUARED)
 
 
 def row_name(choice: RuleChoice, setting: str) -> str:
