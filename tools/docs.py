@@ -99,7 +99,7 @@ def choosing_page() -> str:
     """Return doc/choosing-a-rule.md, written by hand but for its table of promises."""
     from track_fusion.rules import RULES
 
-    rows = [(f"[`{r.key}`](rules.md#{r.key})", r.guarantee, r.caveat, r.cost, r.source) for r in RULES.own.values()]
+    rows = [(f"[`{r.key}`](rules.md#{r.key})", r.promise, r.caveat, r.cost, r.source) for r in RULES.own.values()]
     return _filled("choosing-a-rule.md", _table(("rule", "promise", "when, or what breaks it", "cost", "source"), rows))
 
 

@@ -377,7 +377,7 @@ def test_what_stays_conservative_with_memory():
     """A conservative rule does; naive fusion counts the past again at each step. 250 targets: NEES / n +- .045."""
     found = study_of_memory(["covariance_intersection", "fault_tolerant_covariance_intersection", "naive"])
     for rule in ("covariance_intersection", "fault_tolerant_covariance_intersection"):
-        assert RULES[rule].guarantee == "conservative"
+        assert RULES[rule].guarantee_at() == "conservative"
         assert found[rule, True][0] < 1.0
     assert found["naive", False][0] < 1.4
     assert found["naive", True][0] > 2.0

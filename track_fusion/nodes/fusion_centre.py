@@ -204,7 +204,7 @@ class FusionCentreNode(ManagedNode):
             warnings.append(f"{unsound} fusions gave no density; a single source was taken instead")
         if self._last is not None:
             values["members"] = self._last.members.tolist()
-            if self._last.shared_provenance and rule.guarantee != "conservative":
+            if self._last.shared_provenance and rule.guarantee_at(self.centre.config.rule_params) != "conservative":
                 warnings.append(f"{rule.key} counts information twice: its members hold each other's")
         return warnings, values
 

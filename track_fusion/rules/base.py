@@ -122,9 +122,10 @@ class Example:
     """What the laws of `contract` need to know beyond the descriptor: at which parameters a rule is tried, and how."""
 
     params: tuple[Values, ...] = ({},)
-    guaranteed: tuple[Values, ...] = ({},)  # where the guarantee holds
     not_equivariant: tuple[Values, ...] = ()  # where the result depends on axes and units, if the claim is a text
+    ordered: tuple[Values, ...] = ()  # where the order of the sources matters, if the claim is a text
     idempotent: bool | None = None  # whether copies of one track fuse to that track; None: not stated
+    keeps_one: bool = True  # whether one track alone comes back as it is
     #: by how many standard deviations moments may vary with the random numbers, if every sample is effective; where
     #: parameters name a number of samples
     monte_carlo: float = 0.0
@@ -144,11 +145,11 @@ class Rule:
     params: type[Params]
     family: Family
     arity: Arity
-    guarantee: Guarantee
+    guarantee: Guarantee | Callable[[Any], Guarantee]  # at any parameters, or a function of them
     caveat: str  # when the guarantee holds, or what breaks it
     source: str  # paper and equation numbers
     cost: str  # operations a fusion, in K sources of n axes
-    order_matters: bool = False
+    order_matters: bool | str = False  # a string says when
     needs: tuple[str, ...] = ()  # names of `extras`
     #: (extra, parameter, value): needed as well when the parameter has this value, and of no use otherwise
     needs_when: tuple[tuple[str, str, str], ...] = ()
@@ -157,6 +158,7 @@ class Rule:
     optional_when: tuple[tuple[str, str, str], ...] = ()
     affine_equivariant: bool | str = True  # a string says why not, or under which parameters
     takes_particles: bool = False  # components without covariance; the fusion centre gives other rules their Gaussian
+    takes_phds: bool = False  # mixtures whose weights sum to a number of targets, averaged; other rules normalise them
     linear: bool = False  # the fused mean is linear in the means; all else depends on the covariances alone
     example: Example = Example()
 
@@ -173,6 +175,17 @@ class Rule:
         if missing:
             raise ValueError(f"The rule '{self.key}' needs '{missing[0]}' beside the tracks. Got none.")
         return self.fuse(tracks, params)
+
+    def guarantee_at(self, params: Params | None = None) -> Guarantee:
+        """Return what is guaranteed at these parameters; None: at their defaults."""
+        if not callable(self.guarantee):
+            return self.guarantee
+        return self.guarantee(self.params() if params is None else params)
+
+    @property
+    def promise(self) -> str:
+        """What is guaranteed, in words."""
+        return f"{self.guarantee_at()} by default" if callable(self.guarantee) else self.guarantee
 
     def uses(self, extra: str, params: Params) -> bool:
         """Tell whether an optional extra makes a difference at these parameters."""
