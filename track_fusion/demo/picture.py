@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from msg_adapters.odometry import odometry_from_msg
 from msg_adapters.track_table import track_table_from_msg
 from track_fusion.bags.read import read_bag
 from track_fusion.demo.plan import Demo
@@ -19,13 +18,14 @@ COLORS = ("tab:blue", "tab:orange", "tab:green", "tab:purple", "tab:red")
 def picture(demo: Demo) -> None:
     """Draw what the bag holds."""
     layout, sensors = demo.scene.layout, list(demo.scene.sensors)
-    axes, at = layout.axes, list(layout.position)
+    at = list(layout.position)
     topics = {**{s: f"/{s}/tracks" for s in sensors}, "fused": FUSED}
     messages = read_bag(demo.out / "bag", (TRUTH, *topics.values()))
-    states = np.array([odometry_from_msg(m, axes).tracks.mean[0, 0, at] for m in messages[TRUTH]])
+    told = {t: [TrackBatch(layout=layout, **track_table_from_msg(m).columns) for m in messages[t]] for t in messages}
+    states = np.concatenate([truth.moments[0][:, at] for truth in told[TRUTH]])
     lines = []
     for name, topic in topics.items():
-        moments = [TrackBatch(layout=layout, **track_table_from_msg(m).columns).moments for m in messages[topic]]
+        moments = [tracks.moments for tracks in told[topic]]
         mean = np.concatenate([m[:, at] for m, _ in moments])
         cov = np.concatenate([c[:, at][..., at] for _, c in moments])
         label = f"fused: {demo.rules[-1].replace('_', ' ')}" if name == "fused" else name.replace("_", " ")

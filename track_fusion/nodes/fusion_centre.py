@@ -32,7 +32,7 @@ from track_fusion.centre.publish import StepInfo
 from track_fusion.models.choices import MOTIONS, MotionChoice
 from track_fusion.nodes.managed import ManagedNode
 from track_fusion.nodes.process import end, run
-from track_fusion.nodes.ros_params import chosen, declare
+from track_fusion.nodes.ros_params import chosen, declare, refuse_of_others
 from track_fusion.nodes.screening import FrameParams, screened_tracks
 from track_fusion.params import ParameterError, Params, param
 from track_fusion.plugins import Registry
@@ -95,13 +95,13 @@ class FusionCentreNode(ManagedNode):
         self.kinds = self.sources.kinds
         motion = chosen(self, MOTIONS, declare(self, MotionChoice).motion, self.frame.layout)
         rule = RULES[declare(self, StateFusionParams).state_fusion]
-        rules = {**RULES.own, rule.key: rule}
-        rule_params = {key: declare(self, each.params, f"{key}.") for key, each in rules.items()}
+        refuse_of_others(self, RULES, "state_fusion", rule.key)
+        rule_params = declare(self, rule.params, f"{rule.key}.")
         names = zip(self.sources.source_configurations, self.kinds, strict=True)
         sources = tuple(SourceConfig(name, assembles=not kind.whole_scan) for name, kind in names)
         self.centre = FusionCentre(
             CentreConfig(
-                sources, motion, self.frame.frame_id, rule, rule_params[rule.key], declare(self, FusionCentreParams),
+                sources, motion, self.frame.frame_id, rule, rule_params, declare(self, FusionCentreParams),
                 declare(self, TrackManagerParams), declare(self, ScanBufferParams), declare(self, RandomParams),
             )
         )  # fmt: skip
