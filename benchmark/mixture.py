@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmark import baselines
 from benchmark.measure import Result, race
+from track_fusion.densities.mixture.exponent import optimise_omega
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.densities.mixture.proposals import (
     direct_local_sampling,
@@ -18,7 +19,7 @@ from track_fusion.densities.mixture.proposals import (
 )
 from track_fusion.densities.mixture.quotient import exact_quotient, laplace, wep_quotient
 from track_fusion.densities.mixture.reduction import runnalls
-from track_fusion.densities.mixture.sampling import optimise_omega, single_shot_em
+from track_fusion.densities.mixture.sampling import single_shot_em
 
 AXES = 6
 #: Runs of which a median is taken.

@@ -100,7 +100,7 @@ def choosing_page() -> str:
     """Return doc/choosing-a-rule.md, written by hand but for its table of promises."""
     from track_fusion.rules import RULES
 
-    rows = [(f"[`{r.key}`](rules.md#{r.key})", r.guarantee, r.caveat, r.cost, r.source) for r in RULES.own.values()]
+    rows = [(f"[`{r.key}`](rules.md#{r.key})", r.promise, r.caveat, r.cost, r.source) for r in RULES.own.values()]
     return _filled("choosing-a-rule.md", _table(("rule", "promise", "when, or what breaks it", "cost", "source"), rows))
 
 
@@ -208,20 +208,29 @@ def _table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 def fusion_centre_sections() -> list[Section]:
     """List what the fusion centre declares; a test compares it with the node."""
-    from track_fusion.centre.config import FusionCentreParams, ScanBufferParams, StateFusionParams, TrackManagerParams
+    from track_fusion.centre.config import (
+        TRACK_RULES,
+        FusionCentreParams,
+        ScanBufferParams,
+        StateFusionParams,
+        TrackManagerParams,
+    )
     from track_fusion.models.choices import MOTIONS, MotionChoice
     from track_fusion.nodes.fusion_centre import SourceParams
     from track_fusion.nodes.managed import ManagedParams
     from track_fusion.nodes.screening import FrameParams
     from track_fusion.random_streams import RandomParams
-    from track_fusion.rules import RULES
 
-    used = "read when state_fusion is"
+    default, declared = StateFusionParams().state_fusion, "declared when state_fusion is"
+    rules = {key: rule for key, rule in TRACK_RULES.own.items() if specs(rule.params)}
     return [
         *map(Section, (FrameParams, SourceParams, MotionChoice)),
         *_alternatives("motion", MOTIONS.own, MotionChoice().motion),
         *map(Section, (StateFusionParams, FusionCentreParams)),
-        *(Section(r.params, f"{key}.", f"{r.title}: {used} {key}.") for key, r in RULES.own.items() if specs(r.params)),
+        *(
+            Section(rule.params, f"{key}.", f"{rule.title}: {declared} {key}.", declared=key == default)
+            for key, rule in rules.items()
+        ),
         *map(Section, (ScanBufferParams, TrackManagerParams)),
         Section(RandomParams, title="Random numbers of rules that draw samples: seed, run and role name a stream."),
         Section(ManagedParams),

@@ -32,17 +32,18 @@ class Registry(Mapping[str, T]):
     Attributes
     ----------
     own : dict       ours, and those given by :meth:`add`
+    group : str      as given
     """
 
     def __init__(self, group: str, what: str, kind: type[T], own: Mapping[str, T]) -> None:
         self.own = dict(own)
-        self._group, self._what, self._kind = group, what, kind
+        self.group, self._what, self._kind = group, what, kind
         self._loaded: dict[str, T] = {}
 
     @functools.cached_property
     def _offers(self) -> Mapping[str, list[EntryPoint]]:
         offers: dict[str, list[EntryPoint]] = {}
-        for point in entry_points(group=self._group):
+        for point in entry_points(group=self.group):
             offers.setdefault(point.name, []).append(point)
         return offers
 

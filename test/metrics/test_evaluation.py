@@ -1,11 +1,14 @@
 """Tracks against the truth: matching, errors, consistency, the result as JSON."""
 
 import json
+import pickle
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from track_fusion.metrics.evaluation import MIN_SAMPLES, Evaluation, EvaluationParams
+from track_fusion.metrics.pairing import paired
 from track_fusion.tracks import CONFIRMED, StateLayout, TrackBatch, planar_layout
 
 LAYOUT = planar_layout()
@@ -158,3 +161,144 @@ def test_turn_rates_are_judged_in_degrees_a_second():
     assert figures["turn_rate_armse_degps"] == pytest.approx(np.degrees(0.02))
     assert figures["turn_rate_rmse_degps"] == pytest.approx(np.degrees(np.sqrt((0.03**2 + 0.01**2) / 2)))
     assert "turn_rate_armse_degps" not in evaluation().result()["all"]
+
+
+def test_a_box_whose_front_is_unknown_is_judged_by_its_own_period():
+    layout = StateLayout(("x", "y", "yaw"), (np.inf, np.inf, np.pi))
+    truth, mean = np.array([[0.0, 0.0, 1.5]]), np.array([[0.0, 0.0, -1.6]])
+    pairs = paired(layout, truth, mean, np.eye(3)[None], 1.0)
+    np.testing.assert_allclose(pairs.error, [[0.0, 0.0, np.pi - 3.1]], atol=1e-12)
+
+
+SECOND = 1_000_000_000
+
+
+def moving(time_s, ids=(1,), offset=0.0, stamp_ns=None):
+    """Targets on parabolas, x = 100 id + 5 t^2."""
+    mean = np.array([[100.0 * i + 5 * time_s**2 + offset, 0.0, 10 * time_s, 0.0] for i in ids]).reshape(-1, 4)
+    return TrackBatch.gaussian(
+        LAYOUT, "map", mean, np.tile(np.eye(4), (len(mean), 1, 1)),
+        time_ns=round(time_s * SECOND) if stamp_ns is None else stamp_ns, track_id=np.array(ids),
+    )  # fmt: skip
+
+
+def test_tracks_between_the_stamps_of_the_truth_are_judged_there():
+    """Truth at 2 Hz, tracks at 10 Hz, both of a target that brakes: all errors are those that were put in."""
+    judge = evaluation()
+    for k in range(51):
+        judge.add_tracks(k * SECOND // 10, moving(k / 10, offset=0.3))
+        if k % 5 == 0:
+            judge.add_truth(moving(k / 10))
+    result = judge.result()
+    assert (result["times"], result["missed"], result["false"], result["unjudged"]) == (51, 0, 0, 0)
+    assert result["all"]["position_rmse_m"] == pytest.approx(0.3, abs=1e-9)
+    assert result["all"]["velocity_rmse_mps"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_cannot_be_judged_is_counted_and_nothing_called_consistent():
+    """The truth ends after 9 s of 10: of scans alone beyond it nobody knows how far off they were."""
+    for seconds, verdict, unjudged in ((9, "incomplete", 10), (9.9, "consistent", 1)):
+        rng, judge = np.random.default_rng(0), evaluation()
+        for k in range(101):
+            if k <= 10 * seconds:
+                judge.add_truth(moving(k / 10))
+            track = moving(k / 10)
+            judge.add_tracks(k * SECOND // 10, track.replace(mean=track.mean + rng.normal(size=track.mean.shape)))
+        result = judge.result()
+        assert (result["unjudged"], result["unjudged_times"]) == (unjudged, unjudged)
+        assert (result["times"], result["all"]["verdict"]) == (101 - unjudged, verdict)
+
+
+def test_bad_news_stands_however_much_is_missing():
+    judge = judged(0.1)
+    for stamp in range(200, 300):
+        judge.add_tracks(stamp, batch([(0, 0)], stamp))
+    assert judge.result()["all"]["verdict"] == "overconfident"
+    assert judge.result()["unjudged"] == 100
+
+
+def test_lost_pieces_of_the_truth_are_reported():
+    """What no neighbour tells of is unjudged, and the track of that target is not called false."""
+    judge = Evaluation(LAYOUT, EvaluationParams(max_gap_s=1.0), whole_truth=False)
+    for k in range(10):
+        ids = tuple(i for i in (1, 2, 3) if (i, k) not in {(2, 5), (3, 9)})
+        for i in ids:
+            judge.add_truth(moving(float(k), (i,)))
+        judge.add_tracks(k * SECOND, moving(float(k), (1, 2, 3)))
+    result = judge.result()
+    assert (result["all"]["samples"], result["missed"], result["false"], result["unjudged"]) == (28, 0, 0, 2)
+
+
+def test_a_truth_without_targets_makes_every_track_false():
+    judge = evaluation()
+    judge.add_truth(TrackBatch.empty(LAYOUT, "map"), stamp_ns=7)
+    judge.add_tracks(7, batch([(0, 0), (5, 0)], 7))
+    result = judge.result()
+    assert (result["times"], result["false"], result["unjudged"]) == (1, 2, 0)
+
+
+def test_waiting_scans_are_judged_when_the_truth_comes_late():
+    """One message after the other of either: the truth of 60 s after all tracks, and the other way round."""
+    for tracks_first in (True, False):
+        judge = evaluation()
+        for of_tracks in (tracks_first, not tracks_first):
+            for k in range(60):
+                if of_tracks:
+                    judge.add_tracks(k * SECOND, moving(float(k), (1, 2), offset=1.0))
+                else:
+                    judge.add_truth(moving(float(k), (1, 2)))
+        result = judge.result()
+        assert (result["times"], result["all"]["samples"], result["unjudged"]) == (60, 120, 0)
+
+
+def test_while_the_truth_is_away_it_says_so():
+    judge = evaluation()
+    judge.add_truth(moving(0.0))
+    for k in range(5):
+        judge.add_tracks(k * SECOND, moving(float(k)))
+    assert (judge.unjudged, judge.is_incomplete) == (2, True)
+    for k in range(1, 5):
+        judge.add_truth(moving(float(k)))
+    assert (judge.unjudged, judge.is_incomplete, judge.times) == (0, False, 5)
+
+
+def test_the_figures_are_those_of_all_samples_kept():
+    """Sums and histograms against every sample, as they were once held."""
+    rng, judge = np.random.default_rng(3), evaluation()
+    errors = rng.normal(size=(500, 2, 4))
+    for k, error in enumerate(errors):
+        truth = moving(k / 10, (1, 2))
+        judge.add_truth(truth)
+        judge.add_tracks(k * SECOND // 10, truth.replace(mean=truth.mean + error[:, None], track_id=np.array([8, 9])))
+    result = judge.result()
+    scores = (errors**2).sum(-1)
+    assert result["all"]["anees"] == pytest.approx(scores.mean() / 4, rel=1e-9)
+    for j, target in enumerate(("1", "2")):
+        figures = result["targets"][target]
+        norm = np.linalg.norm(errors[:, j, :2], axis=-1)
+        assert figures["position_rmse_m"] == pytest.approx(np.sqrt((norm**2).mean()), rel=1e-9)
+        assert figures["position_armse_m"] == pytest.approx(norm.mean(), rel=1e-9)
+        assert (figures["track_ids"], figures["id_changes"]) == ([8 + j], 0)
+    edges = scipy.stats.chi2.ppf(np.linspace(0, 1, 11), 4)
+    assert result["all"]["nees_deciles"] == np.histogram(scores, edges)[0].tolist()
+
+
+@pytest.mark.parametrize(("missing", "count"), [("", 36_000), ("truth", 12_000), ("tracks", 12_000)])
+def test_memory_is_flat_over_an_hour(missing, count):
+    """An hour at 10 Hz, identifiers of targets and tracks renewed every 2 s; with truth or tracks absent, a third."""
+    judge, sizes, known = evaluation(), [], moving(0.0, (1, 5000))
+    for k in range(count):
+        known = known.replace(time_ns=np.full(2, k * SECOND // 10), track_id=np.array([1, 5000]) + k // 20)
+        if missing != "truth":
+            judge.add_truth(known)
+        if missing != "tracks":
+            judge.add_tracks(k * SECOND // 10, known)
+        if k + 1 in (3 * count // 4, count):
+            sizes.append(len(pickle.dumps(judge)))
+    assert sizes[1] <= 1.02 * sizes[0]
+    result = judge.result()
+    assert result["times"] == (0 if missing else count)
+    if not missing:
+        others = result["targets"].pop("others")
+        assert others["samples"] + sum(t["samples"] for t in result["targets"].values()) == 72_000
+        assert others["targets"] + len(result["targets"]) == 3600

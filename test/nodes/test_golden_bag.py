@@ -217,7 +217,8 @@ def test_a_bag_of_detections_gives_the_expected_tracks_through_trackers_with_fee
     file, oracle = ROOT / "config" / f"{scenario}.yaml", f"{bag}_{rule}"
     steps = len(expected(oracle)["steps"])
     patient = {"max_future_s": 1000.0, "feedback_timeout_s": 1000.0, "expected_subscribers": 1}
-    criteria = {"covariance_intersection.criterion": "det", "arithmetic_average.criterion": "diversity"}
+    criterion = {"covariance_intersection": "det", "arithmetic_average": "diversity"}.get(rule)
+    criteria = {f"{rule}.criterion": criterion} if criterion else {}
     fusing = {k: v for k, v in PATIENT.items() if k not in ("axes", "use_sim_time")}
     fusing |= {"state_fusion": rule, "expected_subscribers": 3, **criteria, **deep("/fusion_centre/tracks.publisher")}
     with ExitStack() as stack:

@@ -32,6 +32,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
 from msg_adapters.odometry import odometry_to_msgs
+from msg_adapters.track_table import track_table_to_msg
 from track_fusion.tracks import TrackBatch, planar_layout
 
 # ---- start and end -----------------------------------------------------------------------------------------------
@@ -58,6 +59,14 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("replay", {"sceanrio": "li2022-linear"}, "Did you mean 'scenario'?"),
     ("replay", {"sensors": ["sensor_1", "sensor_9"]}, "Unknown sensor 'sensor_9'."),
     ("evaluator", {"outptu": "x.json"}, "Did you mean 'output'?"),
+    (
+        "fusion_centre",
+        {"harmonic_mean.samples": 3},
+        "The 'harmonic_mean.samples' parameter belongs to 'harmonic_mean', but state_fusion is "
+        "'covariance_intersection'.",
+    ),
+    ("fusion_centre", {"state_fusion": "mixture_exact"}, "The 'state_fusion' parameter must be one of 'naive',"),
+    ("evaluator", {"truth_type": "odometrie"}, "Did you mean 'odometry'?"),
     ("evaluator", {"steps": -1}, "The 'steps' parameter must be an integer >= 0. Got -1."),
 ]
 
@@ -134,7 +143,7 @@ def nodes(shared_domain: int, shared_probe: Probe, tmp_path_factory: pytest.Temp
         ("fusion_centre", "jumping_centre", one),
         ("sensor_tracker", "jumping_tracker", tracker),
         ("evaluator", "judge", {"output": str(folder / "judge.json")}),
-        ("evaluator", "doubter", {"output": str(folder / "doubter.json")}),
+        ("evaluator", "doubter", {"output": str(folder / "doubter.json"), "truth_type": "odometry"}),
     ]
     with ExitStack() as stack:
         processes = {}
@@ -256,13 +265,14 @@ def test_a_clock_that_jumps_back_starts_the_tracker_anew(nodes: Set) -> None:
 
 def publish_judged(nodes: Set, name: str, error_m: float) -> None:
     """Send 30 times a truth and a track that is off by `error_m` with a standard deviation of 1 m."""
-    truth = nodes.publisher(f"/{name}/truth", Odometry)
+    whole = name == "judge"  # the other one gets its truth target by target
+    truth = nodes.publisher(f"/{name}/truth", PointCloud2 if whole else Odometry)
     tracks = nodes.publisher(f"/{name}/tracks", PointCloud2)
     for k in range(30):
         at_ns = (1 + k) * SECOND_NS
         state = np.array([[10.0 * k, 0.0, 10.0, 0.0]])
         batch = TrackBatch.gaussian(planar_layout(), "map", state, 1e-12 * np.eye(4)[None], time_ns=at_ns, track_id=[1])
-        for msg in odometry_to_msgs(batch, AXES):
+        for msg in [track_table_to_msg(batch, AXES, at_ns)] if whole else odometry_to_msgs(batch, AXES):
             truth.publish(msg)
         # All four axes are off by one standard deviation, or that times error_m: the NEES is 4 error_m^2.
         tracks.publish(track_table(at_ns, state + error_m * np.array([[1.0, -1.0, 1.0, -1.0]]), ids=[5]))
@@ -278,7 +288,7 @@ def test_the_evaluator_writes_its_json_and_warns_of_overconfidence(nodes: Set) -
         assert process.stop(signal.SIGTERM if overconfident else signal.SIGINT) == 0
         assert ("is overconfident" in process.output()) == overconfident
         result = json.loads((nodes.folder / f"{name}.json").read_text())
-        assert (result["times"], result["missed"], result["false"]) == (30, 0, 0)
+        assert (result["times"], result["missed"], result["false"], result["unjudged"]) == (30, 0, 0, 0)
         assert result["targets"]["1"]["track_ids"] == [5]
         assert result["all"]["anees"] == pytest.approx(error_m**2, rel=1e-9)
         assert result["all"]["verdict"] == ("overconfident" if overconfident else "consistent")

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nav_msgs.msg import Odometry
-from nodes.support import SECOND_NS, START_S, STEP_S, deep, stamp_ns
+from nodes.support import SECOND_NS, START_S, STEP_S, deep, positions, read, stamp_ns
 from ros_helpers import NodeProcess, Probe
 from rosbags.rosbag2 import Reader
 from rosgraph_msgs.msg import Clock
@@ -115,7 +114,7 @@ def test_a_scenario_publishes_what_the_library_draws(ros_context: Any) -> None:
         probe = stack.enter_context(Probe(ros_context))
         topics = ("sensor_1/detections", "sensor_2/detections", "truth")
         seen = {s: probe.listen(f"/replay/{s}/detections", PointCloud2, 1000) for s in ("sensor_1", "sensor_2")}
-        true = probe.listen("/replay/truth", Odometry, 1000)
+        true = probe.listen("/replay/truth", PointCloud2, 1000)
         params = {"pace": "realtime", "rate": rate, "seed": seed, "run": run, "steps": steps}
         params |= {"expected_truth_subscribers": 1, **deep(*(f"/replay/{t}.publisher" for t in topics))}
         process = stack.enter_context(NodeProcess("replay", params=params))
@@ -124,10 +123,9 @@ def test_a_scenario_publishes_what_the_library_draws(ros_context: Any) -> None:
         tracking = get_scenario("li2022-linear").tracking
         assert tracking is not None
         truth = tracking.truth(seed, run, steps)
-        states = [
-            [m.pose.pose.position.x, m.pose.pose.position.y, m.twist.twist.linear.x, m.twist.twist.linear.y]
-            for m in true
-        ]
+        tables = [read(m) for m in true]
+        assert [t.time_ns.tolist() for t in tables] == [[k * SECOND_NS] for k in range(1, steps + 1)]
+        states = [positions(m)[0] for m in true]
         np.testing.assert_array_equal(states, truth[1:])
         for sensor, drawn in tracking.measurements(truth, seed, run).items():
             scans = [detection_table_from_msg(m, ("x", "y")) for m in seen[sensor]]

@@ -100,16 +100,19 @@ def test_arguments_reach_the_nodes_that_own_them_with_their_types() -> None:
 
 def test_the_seed_reaches_all_who_draw() -> None:
     given = overrides(SCENARIO, scenario="li2022-nonlinear-sir", seed="7")
-    assert given == {name: {"seed": 7} for name in ("replay", "fusion_centre", "sensor_1", "sensor_2")}
+    seeded = {name: {"seed": 7} for name in ("replay", "sensor_1", "sensor_2")}
+    own = {"arithmetic_average.criterion": "diversity", "arithmetic_average.output": "mixture"}
+    assert given == {**seeded, "fusion_centre": {"seed": 7, **own}}
 
 
 def test_without_arguments_the_parameter_file_decides() -> None:
-    assert overrides(SCENARIO) == {}
+    assert overrides(SCENARIO) == {"fusion_centre": {"covariance_intersection.criterion": "trace"}}
 
 
 def test_the_demo_runs_in_lockstep_with_the_rule_asked_for() -> None:
     given = overrides(DEMO, rule="arithmetic_average")
-    assert given == {"fusion_centre": {"state_fusion": "arithmetic_average"}, "replay": {"pace": "lockstep"}}
+    own = {"arithmetic_average.criterion": "diversity"}
+    assert given == {"fusion_centre": {"state_fusion": "arithmetic_average", **own}, "replay": {"pace": "lockstep"}}
 
 
 def test_an_unknown_scenario_is_refused_with_those_there_are() -> None:

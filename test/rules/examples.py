@@ -11,7 +11,7 @@ import pytest
 from track_fusion.linalg import Array
 from track_fusion.params import from_dict
 from track_fusion.rules import RULES, Mixture, SourceTracks
-from track_fusion.rules.contract import covariances, joint_covariances
+from track_fusion.rules.trials import covariances, joint_covariances
 
 __all__ = ["COUNTER_EXAMPLES", "covariances", "joint_covariances", "rotated", "scalar_nees"]
 
@@ -23,6 +23,22 @@ def _naive_copies() -> tuple[float, float]:
     error = cov  # the mean of copies is the copy
     np.testing.assert_allclose(fused.mean, 3.0)
     return float(np.trace(error) / np.trace(fused.cov)), 4.0
+
+
+def _weights_that_follow_the_errors() -> tuple[float, float]:
+    """Three scalar tracks whose errors are 3, 2, 2 in four cases of five, and else 4, 6, 4."""
+    error, chance = np.array([[3.0, 2.0, 2.0], [4.0, 6.0, 4.0]])[..., None], np.array([0.8, 0.2])
+    variance = np.einsum("c,cki->k", chance, error**2)
+    np.testing.assert_allclose(variance, [10.4, 10.4, 6.4])
+    fused = RULES["arithmetic_average"](SourceTracks(error, np.tile(variance[:, None, None], (2, 1, 1, 1))))
+    return float(chance @ fused.mean[:, 0] ** 2 / (chance @ fused.cov[:, 0, 0])), 1.115
+
+
+def _another_correlation() -> tuple[float, float]:
+    """Two tracks of variance 1 whose errors have the correlation .9, said to have the default's .4."""
+    fused = RULES["cross_covariance"](SourceTracks(np.array([[1.0], [0.0]]), np.ones((2, 1, 1))))
+    np.testing.assert_allclose(fused.mean, 0.5)  # half of each
+    return (0.25 + 0.25 + 2.0 * 0.25 * 0.9) / float(fused.cov[0, 0]), 0.95 / 0.7
 
 
 def _overlapping_copies() -> tuple[float, float]:
@@ -130,6 +146,8 @@ def rotated(rng: np.random.Generator, eigenvalues: Array) -> Array:
 #: The true error variance over the claimed one, measured and as stated, for every rule of guarantee none or structural.
 COUNTER_EXAMPLES: dict[str, Callable[[], tuple[float, float]]] = {
     "naive": _naive_copies,
+    "arithmetic_average": _weights_that_follow_the_errors,
+    "cross_covariance": _another_correlation,
     "fast_covariance_intersection": _fast_intersection,
     "inverse_covariance_intersection": _inverse_intersection,
     "ellipsoidal_intersection": _ellipsoidal_intersection,

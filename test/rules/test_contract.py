@@ -13,7 +13,8 @@ from rules.examples import COUNTER_EXAMPLES, covariances, joint_covariances
 
 from track_fusion.params import ParameterError, Params, from_dict, specs
 from track_fusion.rules import RULES, Example, FusedTracks, Rule, SourceTracks, get_rule
-from track_fusion.rules.contract import LAWS, BrokenLaw, Case, check
+from track_fusion.rules.contract import HELD, LAWS, check
+from track_fusion.rules.trials import BrokenLaw, Case
 
 EVERY_RULE = pytest.mark.parametrize("rule", RULES.own.values(), ids=RULES.own)
 BY_NAME = {law.__name__: law for law in LAWS}
@@ -33,8 +34,9 @@ def test_keys() -> None:
 def test_law(rule: Rule, seed: int) -> None:
     """Each law is kept, and none is passed over but where the descriptor claims nothing."""
     example = dataclasses.replace(rule.example, counter_example=COUNTER_EXAMPLES.get(rule.key))
-    promises = rule.guarantee in ("conservative", "exact")
-    silent = {"linearity": not rule.linear, "guarantee": not promises, "counter_example": promises}
+    promises = [case.guarantee in HELD for v in example.params for case in [Case(rule, example, v, 2)]]
+    by_default = rule.guarantee_at() in HELD
+    silent = {"linearity": not rule.linear, "guarantee": not any(promises), "counter_example": by_default}
     reason = LAWS[seed](rule, example, np.random.default_rng(seed))
     assert (reason is not None) == silent.get(LAWS[seed].__name__, False), reason
 
@@ -124,6 +126,7 @@ BROKEN: dict[str, tuple[str, Rule]] = {
     "claims that the order matters": ("order_of_sources", _claiming(order_matters=True)),
     "adds a metre": ("affine_equivariance", _giving(mean=lambda t, f: f.mean + 1.0)),
     "claims to depend on units": ("affine_equivariance", _claiming(affine_equivariant=False)),
+    "looks at the origin": ("axes_that_wrap", _giving(mean=lambda t, f: 1.01 * f.mean)),
     "claims too little": ("guarantee", _giving(cov=lambda t, f: 0.9 * f.cov)),
     "claims far too much": ("guarantee", _giving(cov=lambda t, f: 2.0 * f.cov)),
     "promises for a mean that bends": ("guarantee", _giving(mean=lambda t, f: f.mean**3)),
@@ -249,6 +252,10 @@ def test_malformed_tracks(rule: Rule) -> None:
     assert fail(cov=cov) == "The 'cov' of source tracks must be symmetric."
     assert fail(dof=np.full((3, 2), 2.0)) == "The 'dof' of source tracks must exceed 2. Got 2.0."
     assert fail(dof=np.full(3, 5.0)) == "The 'dof' of source tracks must have shape (3, 2). Got (3,)."
+    assert fail(periods=(6.0, -1.0, np.inf, np.inf)) == (
+        "The 'periods' of source tracks must be 4 numbers > 0, infinite where an axis does not wrap. "
+        "Got (6.0, -1.0, inf, inf)."
+    )
     for name in rule.needs:
         assert fail(extras={}) == f"The rule '{rule.key}' needs '{name}' beside the tracks. Got none."
         break

@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from densities.mixture.examples import draw
+from densities.mixture.integrals import Problem as Integral
+from densities.mixture.integrals import problems as problems_with_integral
+from densities.mixture.integrals import taken, verdict
 from rules.mixtures import as_tracks
 
 from track_fusion.densities.log_domain import normalised
@@ -17,7 +20,7 @@ from track_fusion.densities.mixture.sampling import Weighted, single_shot_em
 from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.linalg import Array
 from track_fusion.params import from_dict
-from track_fusion.rules import FusedTracks, SourceTracks, get_rule
+from track_fusion.rules import FusedTracks, SourceTracks, get_rule, mixture_exact
 from track_fusion.rules.shared import sampling
 from track_fusion.scenarios.ahmed.mixtures import Problem, log_fused
 from track_fusion.scenarios.ahmed.random import study_problem
@@ -187,6 +190,38 @@ def test_pairs_without_integral_can_be_skipped() -> None:
         assert np.isfinite(fused.mean).all()
         assert fused.mixture is not None
         assert fused.mixture.weight.sum() == pytest.approx(1.0)
+
+
+def _two_equal_sources(problem: Integral) -> SourceTracks:
+    """Two sources whose product is the Gaussian of the problem."""
+    n = len(problem.cov)
+    part = Mixture(np.ones((2, 1)), np.zeros((2, 1, n)), np.stack([2.0 * problem.cov] * 2)[:, None])
+    return dataclasses.replace(as_tracks(part), extras={"common": problem.common})
+
+
+@pytest.mark.parametrize("method", ["dls", "igs", "laplace", "common_proposal"])
+def test_a_pair_that_nothing_proves_is_taken_by_its_samples(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    undecided = [p for p in problems_with_integral(1e-2, 0.15) if not verdict(p.cov, p.common).proved[0]]
+    sampled = [p for p in undecided if all(taken(p, seed) for seed in range(5))][:3]
+    assert len(sampled) == 3
+    for problem in sampled:
+        fused = run("mixture_exact", _two_equal_sources(problem), method=method)
+        assert fused.info["undecided"] == 1
+        assert fused.info["least_difference"] == pytest.approx(problem.difference, rel=1e-3)
+    plain = run("mixture_exact", _split(1.5), method=method)
+    assert (plain.info["undecided"], plain.info["least_difference"]) == (0, 1.0)
+    monkeypatch.setattr(mixture_exact, "EFFECTIVE", 1.0)
+    with pytest.raises(
+        ValueError, match="of 1 it is neither proved nor refuted, and no more than 100% of samples count"
+    ):
+        run("mixture_exact", _two_equal_sources(sampled[0]), method=method)
+
+
+@pytest.mark.parametrize("method", ["dls", "igs", "laplace", "common_proposal"])
+def test_a_pair_without_integral_is_refused_with_the_direction(method: str) -> None:
+    for problem in problems_with_integral(-0.05, -1e-3)[:20]:
+        with pytest.raises(ValueError, match=r"has no integral for 1 of 1 pairs.*, as along \(-?[0-9.e-]+, .*\)\."):
+            run("mixture_exact", _two_equal_sources(problem), method=method)
 
 
 def test_common_information_that_does_not_fit_is_refused() -> None:

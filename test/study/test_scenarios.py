@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_rel
 
+from track_fusion.angles import TURN, difference, wrap
 from track_fusion.linalg import transpose
 from track_fusion.metrics.accuracy import Estimate, armse
 from track_fusion.params import ParameterError
@@ -48,6 +49,21 @@ def test_another_rule_sees_every_run(key):
     each = rule.fuse(SourceTracks(mean, np.repeat(cov, 5, 0)), rule.params())
     np.testing.assert_array_equal(fused.mean, each.mean)
     np.testing.assert_array_equal(fused.cov, each.cov)
+
+
+@pytest.mark.parametrize("key", ["naive", "covariance_union", "geometric_mean_sampling"])
+def test_directions_of_runs_are_fused_on_the_circle(key):
+    """At the seam as at zero, turned, also by a linear rule."""
+    rng, choice, periods = np.random.default_rng(8), RuleChoice(key, RULES[key].params()), (np.inf, TURN)
+    mean, cov = 0.1 * rng.normal(size=(5, 2, 2)), np.stack([np.eye(2), np.diag([2.0, 3.0])])[None]
+
+    def fused(turn):
+        turned = wrap(mean + [0.0, turn], periods)
+        return fuse_runs(choice, turned, cov, [np.random.default_rng(k) for k in range(5)], periods=periods)
+
+    here, there = fused(0.0), fused(np.pi)
+    np.testing.assert_allclose(difference(there.mean - [0.0, np.pi], here.mean, periods), 0.0, atol=1e-9)
+    np.testing.assert_allclose(there.cov, here.cov, rtol=1e-9, atol=1e-12)
 
 
 def test_each_run_of_a_rule_that_samples_draws_its_own_numbers():

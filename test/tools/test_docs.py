@@ -75,7 +75,7 @@ def test_the_guide_names_rules_that_exist_and_tells_of_each_its_promise() -> Non
     options = {name for rule in RULES.values() for name in specs(rule.params)}
     assert advised - options <= set(RULES)
     for rule in RULES.values():
-        assert f"| [`{rule.key}`](rules.md#{rule.key}) | {rule.guarantee} |" in table
+        assert f"| [`{rule.key}`](rules.md#{rule.key}) | {rule.promise} |" in table
 
 
 def test_elsewhere_than_in_a_source_tree_it_is_refused(tmp_path: Path) -> None:

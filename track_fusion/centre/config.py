@@ -12,6 +12,7 @@ from track_fusion.linalg import Array
 from track_fusion.models.base import Motion
 from track_fusion.models.transforms import Transform
 from track_fusion.params import ParameterError, Params, param
+from track_fusion.plugins import Registry
 from track_fusion.random_streams import RandomParams
 from track_fusion.rules import RULES, Rule, SourceTracks
 from track_fusion.solvers.chi_square import chi_square_quantile
@@ -23,11 +24,19 @@ MAX_SOURCES = 32
 HISTORY_BITS = 32
 
 
+#: What source tracks do not bring and a centre has all the same.
+_AT_HAND = frozenset({"seed"})
+#: The rules that a centre can run: all but those that need more than tracks, whatever their parameters.
+TRACK_RULES: Registry[Rule] = Registry(
+    RULES.group, "rule", Rule, {key: rule for key, rule in RULES.own.items() if not set(rule.needs) - _AT_HAND}
+)
+
+
 @dataclasses.dataclass(frozen=True)
 class StateFusionParams(Params):
     """How tracks are fused."""
 
-    state_fusion: str = param("covariance_intersection", "the fusion rule", choices=RULES)
+    state_fusion: str = param("covariance_intersection", "the fusion rule", choices=TRACK_RULES)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,7 +180,7 @@ class CentreConfig:
     def __post_init__(self) -> None:
         if len(self.sources) > MAX_SOURCES:
             raise ParameterError(f"The 'sources' must be at most {MAX_SOURCES}. Got {len(self.sources)}.")
-        needed = sorted(set(self.rule.needed(self.rule_params)) - {"seed"})
+        needed = sorted(set(self.rule.needed(self.rule_params)) - _AT_HAND)
         if needed:
             raise ParameterError(
                 f"The 'state_fusion' parameter must be a rule that needs only tracks. Got '{self.rule.key}', "

@@ -19,7 +19,7 @@ def record(out: Path, topics: tuple[str, ...], storage: str, sim_time: bool) -> 
 
     \b
     Example:
-      track-fusion record run1 /fusion_centre/tracks /replay/truth:nav_msgs/msg/Odometry
+      track-fusion record run1 /fusion_centre/tracks /fusion_centre/odometry:nav_msgs/msg/Odometry
     """  # noqa: D301  click reads \b as "do not wrap"
     from track_fusion.nodes.recorder import record_until_told
 

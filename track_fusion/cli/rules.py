@@ -75,10 +75,11 @@ def describe(rule: Rule) -> dict[str, Any]:
     """Return what the registry says of a rule, its parameters included."""
     from track_fusion.cli.output import parameters
 
-    names = ("key", "title", "family", "arity", "guarantee", "caveat", "order_matters", "needs",
+    names = ("key", "title", "family", "arity", "caveat", "order_matters", "needs",
              "needs_when", "optional", "affine_equivariant")  # fmt: skip
     return {
         **{name: getattr(rule, name) for name in names},
+        "guarantee": rule.promise,
         "source": rule.source,
         "cost": rule.cost,
         "parameters": parameters(rule.params),
@@ -95,7 +96,8 @@ def facts(rule: dict[str, Any]) -> list[tuple[str, str]]:
     if rule["optional"]:
         lines.append(("Can use", ", ".join(rule["optional"])))
     if rule["order_matters"]:
-        lines.append(("Order", "the result depends on the order of the tracks"))
+        when = rule["order_matters"]
+        lines.append(("Order", f"the result depends on the order of the tracks{'' if when is True else f', {when}'}"))
     if rule["affine_equivariant"] is not True:
         said = rule["affine_equivariant"]
         lines.append(("Other axes or units", said if isinstance(said, str) else "give another result"))

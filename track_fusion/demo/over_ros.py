@@ -32,7 +32,7 @@ RUN_DEADLINE_S = 300.0
 LAST_MESSAGES_S = 5.0
 #: Domains that Linux's default range of ephemeral ports leaves free.
 DOMAINS = 101
-TABLE, ODOMETRY = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry"
+TABLE = "sensor_msgs/msg/PointCloud2"
 
 Progress = Callable[[str, float], None]
 
@@ -49,9 +49,10 @@ def over_ros(demo: Demo, rule: str | None, progress: Progress) -> dict[str, floa
     fused = _run(demo, rule, judged, log, lambda share: progress(f"ROS, {name}", share))
     result = json.loads(judged.read_text())
     judged.unlink()
-    if result["times"] != demo.results or (result["missed"] and not demo.many_targets):
+    if result["times"] != demo.results or result["unjudged"] or (result["missed"] and not demo.many_targets):
         raise Fault(
-            f"{name}: {result['times']} of {demo.results} steps were judged, {result['missed']} missed; see {log}."
+            f"{name}: {result['times']} of {demo.results} steps were judged, {result['unjudged']} samples could not "
+            f"be, {result['missed']} were missed; see {log}."
         )
     if demo.scenario.judge is None:
         return {k: v for k, v in result["all"].items() if "armse" in k}
@@ -89,7 +90,7 @@ def _run(demo: Demo, rule: str | None, judged: Path, log: Path, progress: Callab
 
 def _recorded(demo: Demo) -> dict[str, str]:
     """Topics of the bag and their types; of many targets all but the detections, which are very many."""
-    topics = {TRUTH: ODOMETRY, **{f"/{s}/tracks": TABLE for s in demo.scene.sensors}, FUSED: TABLE}
+    topics = {TRUTH: TABLE, **{f"/{s}/tracks": TABLE for s in demo.scene.sensors}, FUSED: TABLE}
     return topics | ({} if demo.many_targets else {f"/replay/{s}/detections": TABLE for s in demo.scene.sensors})
 
 

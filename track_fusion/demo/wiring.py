@@ -69,6 +69,8 @@ class Bringup:
     filter : str                of the trackers
     result_every : int          the centre fuses at every so many steps
     sections : mapping          parameters of each node by name, as the file gives them
+    of_rule : mapping           what the file gives the fusion centre besides, by the rule it fuses by: the sections
+                                fusion_centre/<rule>
     """
 
     def __init__(self, name: str, folder: Path | None = None) -> None:
@@ -80,7 +82,9 @@ class Bringup:
             raise unknown_name_error(name, known, "parameter file of a scenario")
         self.path = folder / f"{name}.yaml"
         content = yaml.safe_load(self.path.read_text())
-        self.sections = {node: section["ros__parameters"] for node, section in content.items()}
+        sections = {node: section["ros__parameters"] for node, section in content.items()}
+        self.sections = {node: section for node, section in sections.items() if "/" not in node}
+        self.of_rule = {node.partition("/")[2]: section for node, section in sections.items() if "/" in node}
         self.scenario = str(self.sections["replay"]["scenario"])
         self.trackers = tuple(node for node in self.sections if node not in OTHERS)
         self.filter = str(self.sections[self.trackers[0]].get("filter", "kalman"))
@@ -104,10 +108,12 @@ class Bringup:
             remaps["evaluator"] = {"~/truth": TRUTH, "~/tracks": result}
         remaps["replay"] = {"~/fused": result}
         alone: Overrides = {} if fused else {"replay": {"sensors": list(sensors)}, sensors[0]: {"feedback": "none"}}
+        centre = {**self.sections["fusion_centre"], **overrides.get("fusion_centre", {})}
+        given = {"fusion_centre": self.of_rule.get(centre.get("state_fusion"), {}), **alone}
         draw = {key: value for key, value in overrides.get("replay", {}).items() if key in _DRAW}
 
         def spec(name: str) -> NodeSpec:
-            params = {**(draw if self._draws(name) else {}), **alone.get(name, {}), **overrides.get(name, {})}
+            params = {**(draw if self._draws(name) else {}), **given.get(name, {}), **overrides.get(name, {})}
             return NodeSpec(name if name in OTHERS else "sensor_tracker", name, self.path, params, remaps[name])
 
         return [spec(name) for name in remaps]

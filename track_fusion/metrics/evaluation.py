@@ -1,26 +1,28 @@
-"""Tracks against the truth: errors and consistency, per target and over all."""
+"""Tracks against the truth: errors and consistency, per target and over all, in a memory that does not grow."""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
-import math
-from collections import defaultdict
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from track_fusion.linalg import Array
-from track_fusion.metrics.consistency import Consistency, consistency, consistency_of_sum
-from track_fusion.metrics.pairing import paired
+from track_fusion.metrics.consistency import Consistency, consistency_of_sum
+from track_fusion.metrics.pairing import Pairs, paired
+from track_fusion.metrics.tally import Errors, Tally, TargetTallies
+from track_fusion.metrics.truth import Known, Truth
 from track_fusion.params import Params, param
 from track_fusion.solvers.chi_square import chi_square_quantile
-from track_fusion.tracks import StateLayout, TrackBatch
+from track_fusion.tracks import SECOND_NS, StateLayout, TrackBatch
 
 #: Fewer samples than this prove nothing.
 MIN_SAMPLES = 10
 #: How often a consistent estimator may be called overconfident: seldom, since one looks again and again while samples
 #: come, and samples of one run are correlated.
 FALSE_ALARM = 1e-5
+#: With a larger share of samples that could not be judged nothing is called consistent.
+MAX_UNJUDGED = 0.05
+#: So many scans wait for the truth at most, and so many steps of the truth for scans.
+MAX_HELD = 1000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,65 +37,168 @@ class EvaluationParams(Params):
         strict=True,
     )
     confirmed_only: bool = param(True, "judge confirmed tracks only")
+    max_gap_s: float = param(
+        1.0,
+        "tracks are judged between two states of the truth, too, when these are no farther apart; 0: at equal stamps "
+        "only",
+        unit="s",
+        low=0.0,
+    )
 
 
-class Sample(NamedTuple):
-    """A target with its track at one time: identifiers, error (n,), NEES."""
+class Judgement(NamedTuple):
+    """One scan against the truth: pairs, tracks in the scan, and the truth; None: there is none of that time."""
 
-    target: int
-    track: int
-    error: Array
-    nees: float
+    pairs: Pairs | None
+    tracks: TrackBatch
+    truth: Known | None
+
+
+class Totals:
+    """Sums over judged scans."""
+
+    def __init__(self, layout: StateLayout) -> None:
+        self._layout, self.all, self.targets = layout, Tally(layout), TargetTallies(layout)
+        self.times = self.missed = self.false = self.unjudged = self.unjudged_times = 0
+
+    def add(self, judged: Judgement) -> None:
+        """Take a scan."""
+        pairs, tracks, truth = judged
+        if pairs is None or truth is None:
+            self.unjudged_times += 1
+            self.unjudged += max(len(tracks), 1)  # nobody knows how many targets there were
+            return
+        matched = len(pairs.nees)
+        self.times += 1
+        self.missed += len(truth.targets) - matched
+        self.unjudged += truth.unknown
+        # A track without a target may be that of one whose truth is unknown.
+        self.false += max(len(tracks) - matched - truth.unknown, 0)
+        errors = Errors.of(self._layout, pairs.error, pairs.nees)
+        self.all.add(errors)
+        for k, (i, j) in enumerate(zip(pairs.target, pairs.track, strict=True)):
+            self.targets.add(int(truth.targets[i]), int(tracks.track_id[j]), errors.one(k))
+
+    @property
+    def is_incomplete(self) -> bool:
+        """Whether more samples could not be judged than may be passed over."""
+        return _is_incomplete(self.all.samples + self.missed, self.unjudged)
 
 
 class Evaluation:
-    """Collects truth and tracks by stamp, in any order, and judges each time at which both are there.
+    """Judges tracks where the truth is known: at its stamps, and between them by interpolation.
 
-    Targets and tracks are matched one to one by least total distance between positions.
+    Truth and tracks come in any order. A scan is judged as soon as the truth around it is there, and anew when more of
+    that truth comes, until the truth has gone on by `max_gap_s`; from then on it is part of sums. Targets and tracks
+    are matched one to one by least total distance between positions. Neither the truth nor the tracks are
+    extrapolated: what is not covered is counted as unjudged.
+
+    Parameters
+    ----------
+    layout : StateLayout
+    params : EvaluationParams
+    whole_truth : bool    each step of the truth is one table; False: it comes target by target, and may have gaps
     """
 
-    def __init__(self, layout: StateLayout, params: EvaluationParams) -> None:
+    def __init__(self, layout: StateLayout, params: EvaluationParams, whole_truth: bool = True) -> None:
         self._layout, self._params = layout, params
-        self._truth: dict[int, list[TrackBatch]] = defaultdict(list)
-        self._tracks: dict[int, TrackBatch] = {}
-        self._judged: dict[int, list[Sample]] = {}
-        self._nees_sum, self._samples_judged = 0.0, 0
+        self._max_gap_ns = round(params.max_gap_s * SECOND_NS)
+        self._truth = Truth(layout, self._max_gap_ns, whole_truth)
+        self._scans: dict[int, TrackBatch] = {}  # not yet in the sums
+        self._judged: dict[int, Judgement] = {}  # of these, as far as they can be judged so far
+        self._closed = Totals(layout)
+        self._closed_ns: int | None = None  # stamp of the last scan in the sums
+        self._answered: set[int] = set()  # steps of the truth held that a scan was judged at
+        self._unanswered = 0  # steps of the truth dropped that none was
 
     @property
     def times(self) -> int:
         """Number of times judged."""
-        return len(self._judged)
+        return self._closed.times + len(self._judged)
 
-    def add_truth(self, truth: TrackBatch) -> None:
-        """Take the true state of a target; a repeated one replaces the one before."""
-        if len(truth):
-            stamp_ns, again = int(truth.time_ns[0]), set(truth.track_id.tolist())
-            others = [b for b in self._truth[stamp_ns] if again.isdisjoint(b.track_id.tolist())]
-            self._truth[stamp_ns] = [*others, truth]
-            self._judge(stamp_ns)
+    @property
+    def unjudged(self) -> int:
+        """Number of samples that could not be judged; the truth of the newest may still be on its way."""
+        late = max(self._scans, default=0) - self._max_gap_ns
+        waiting = [tracks for s, tracks in self._scans.items() if s < late and s not in self._judged]
+        return self._closed.unjudged + sum(max(len(tracks), 1) for tracks in waiting)
+
+    @property
+    def is_incomplete(self) -> bool:
+        """Whether these are too many for a verdict."""
+        return _is_incomplete(self.consistency().samples + self._closed.missed, self.unjudged)
+
+    def add_truth(self, truth: TrackBatch, stamp_ns: int | None = None) -> None:
+        """Take the true states at a time, or of some targets; a repeated one replaces the one before.
+
+        `stamp_ns` tells the time of a step without targets, which has none of its own.
+        """
+        if stamp_ns is None:
+            if not len(truth):
+                return
+            stamp_ns = int(truth.time_ns[0])
+        self._truth.add(stamp_ns, truth.track_id.tolist(), truth.moments[0])
+        for scan_ns in [s for s in self._scans if abs(s - stamp_ns) <= self._max_gap_ns]:
+            judged = self._judged.get(scan_ns)
+            if scan_ns == stamp_ns or judged is None or judged.truth is None or not judged.truth.exact:
+                self._judge(scan_ns)
+        self._settle()
 
     def add_tracks(self, stamp_ns: int, tracks: TrackBatch) -> None:
         """Take the tracks of a time, also when there are none."""
-        self._tracks[stamp_ns] = tracks[tracks.is_confirmed] if self._params.confirmed_only else tracks
+        tracks = tracks[tracks.is_confirmed] if self._params.confirmed_only else tracks
+        if self._closed_ns is not None and stamp_ns <= self._closed_ns:
+            self._closed.add(Judgement(None, tracks, None))
+            return
+        self._scans[stamp_ns] = tracks
         self._judge(stamp_ns)
+        self._settle()
 
     def _judge(self, stamp_ns: int) -> None:
-        """Judge one time as soon as truth and tracks are there; more truth of the same time judges it again."""
-        if stamp_ns not in self._tracks or stamp_ns not in self._truth:
-            return
-        truth, tracks = TrackBatch.concatenate(self._truth[stamp_ns]), self._tracks[stamp_ns]
-        pairs = paired(self._layout, truth.moments[0], *tracks.moments, self._params.max_distance_m)
-        before = self._judged.get(stamp_ns, [])
-        self._judged[stamp_ns] = [
-            Sample(int(truth.track_id[i]), int(tracks.track_id[j]), error, float(score))
-            for i, j, error, score in zip(*pairs, strict=True)
-        ]
-        self._nees_sum += float(pairs.nees.sum()) - sum(sample.nees for sample in before)
-        self._samples_judged += len(pairs.nees) - len(before)
+        """Judge a scan as far as it can be."""
+        judged = self._judgement(stamp_ns)
+        if judged.truth is not None:
+            self._judged[stamp_ns] = judged
+
+    def _judgement(self, stamp_ns: int) -> Judgement:
+        tracks, known = self._scans[stamp_ns], self._truth.at(stamp_ns)
+        if known is None:
+            return Judgement(None, tracks, None)
+        return Judgement(
+            paired(self._layout, known.states, *tracks.moments, self._params.max_distance_m), tracks, known
+        )
+
+    def _settle(self) -> None:
+        """Close the scans that no more truth will change, and drop the truth that no scan needs any more."""
+        newest, ordered = self._truth.newest_ns, sorted(self._scans)
+        last = ordered[-1] if ordered else self._closed_ns
+        for k, stamp_ns in enumerate(ordered):
+            if (newest is None or stamp_ns >= newest - self._max_gap_ns) and len(ordered) - k <= MAX_HELD:
+                break
+            self._close(stamp_ns)
+        first = min(self._scans, default=last)
+        if first is None:
+            first = self._truth.stamps[0]
+        for stamp_ns in self._truth.forget(first - self._max_gap_ns, MAX_HELD):
+            self._unanswered += stamp_ns not in self._answered
+            self._answered.discard(stamp_ns)
+
+    def _close(self, stamp_ns: int) -> None:
+        judged = self._judged.get(stamp_ns)
+        if judged is None or judged.truth is None or not judged.truth.exact:
+            judged = self._judgement(stamp_ns)
+        self._closed.add(judged)
+        if judged.truth is not None and self._truth.has(stamp_ns):
+            self._answered.add(stamp_ns)
+        del self._scans[stamp_ns]
+        self._judged.pop(stamp_ns, None)
+        self._closed_ns = stamp_ns
 
     def consistency(self) -> Consistency:
         """ANEES over all targets and times; kept up to date, since a node asks at every message."""
-        return consistency_of_sum(self._nees_sum, self._samples_judged, self._layout.size)
+        scores = [judged.pairs.nees for judged in self._judged.values() if judged.pairs is not None]
+        total = self._closed.all.nees + sum(float(nees.sum()) for nees in scores)
+        return consistency_of_sum(total, self._closed.all.samples + sum(map(len, scores)), self._layout.size)
 
     def is_overconfident(self) -> bool:
         """Tell whether errors are larger than the covariances say, on enough samples and beyond doubt."""
@@ -102,44 +207,28 @@ class Evaluation:
         return score.samples >= MIN_SAMPLES and score.anees > chi_square_quantile(1.0 - FALSE_ALARM, terms) / terms
 
     def result(self) -> dict[str, Any]:
-        """Everything as JSON-ready values: figures over all and for each target, unmatched tracks and targets."""
-        samples = [sample for _, at_once in sorted(self._judged.items()) for sample in at_once]
-        targets = sorted({s.target for s in samples})
-        matched = len(samples)
-        truths = sum(len(b) for t in self._judged for b in self._truth[t])
-        published = sum(len(self._tracks[t]) for t in self._judged)
+        """Everything as JSON-ready values: figures over all and for each target, what was unmatched or not judged.
+
+        The verdict over all is "incomplete" instead of "consistent" when too many samples could not be judged.
+        """
+        totals = copy.deepcopy(self._closed)
+        for stamp_ns in sorted(self._scans):
+            totals.add(self._judgement(stamp_ns))
+        figures = totals.all.figures()
+        if totals.is_incomplete and figures["verdict"] == "consistent":
+            figures["verdict"] = "incomplete"
+        lonely = sum(s not in self._answered and s not in self._scans for s in self._truth.stamps)
         return {
-            "times": self.times,
-            "unmatched_times": len(set(self._truth) ^ set(self._tracks)),
-            "missed": truths - matched,
-            "false": published - matched,
-            "all": self._figures(samples),
-            "targets": {
-                str(t): self._figures([s for s in samples if s.target == t])
-                | {"track_ids": sorted({s.track for s in samples if s.target == t})}
-                for t in targets
-            },
+            "times": totals.times,
+            "unmatched_times": self._unanswered + lonely + totals.unjudged_times,
+            "unjudged_times": totals.unjudged_times,
+            "missed": totals.missed,
+            "false": totals.false,
+            "unjudged": totals.unjudged,
+            "all": figures,
+            "targets": totals.targets.figures(),
         }
 
-    def _figures(self, samples: list[Sample]) -> dict[str, Any]:
-        """RMSE, mean error norm (the one-run ARMSE) and consistency of some samples."""
-        errors = np.array([s.error for s in samples]).reshape(-1, self._layout.size)
-        score = consistency(np.array([s.nees for s in samples]), self._layout.size)
-        figures: dict[str, Any] = {"samples": len(samples)}
-        rate = tuple(i for i, name in enumerate(self._layout.axes) if name == "turn_rate")
-        quantities = [("position", self._layout.position, "m", 1.0), ("velocity", self._layout.velocity, "mps", 1.0)]
-        quantities += [("turn_rate", rate, "degps", float(np.degrees(1.0)))] if rate else []
-        for name, at, unit, factor in quantities:
-            norm = factor * np.linalg.norm(errors[:, list(at)], axis=1)
-            figures[f"{name}_rmse_{unit}"] = _number(np.sqrt((norm**2).mean()) if len(norm) else math.nan)
-            figures[f"{name}_armse_{unit}"] = _number(norm.mean() if len(norm) else math.nan)
-        figures |= {
-            "anees": _number(score.anees), "anees_low": _number(score.low), "anees_high": _number(score.high),
-            "verdict": score.verdict,
-        }  # fmt: skip
-        return figures
 
-
-def _number(value: float) -> float | None:
-    """JSON knows no NaN."""
-    return None if math.isnan(value) else float(value)
+def _is_incomplete(judged: int, unjudged: int) -> bool:
+    return unjudged > MAX_UNJUDGED * (judged + unjudged)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 import time
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import rclpy.utilities
@@ -21,7 +22,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from msg_adapters.arrays import MessageError
 from msg_adapters.diagnostics import diagnostic_array
 from msg_adapters.types import message_class
-from track_fusion.nodes.ros_params import declare, refuse_unknown
+from track_fusion.nodes.ros_params import declare, refuse_unknown, unfit_files
 from track_fusion.params import Fault, ParameterError, Params, param
 
 DIAGNOSTICS_PERIOD_S = 1.0
@@ -88,12 +89,20 @@ class ManagedNode(LifecycleNode):
         self.managed = declare(self, ManagedParams)
         self.declare_parameters_()
         refuse_unknown(self)
+        self._warn_of_unfit_files(kwargs)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos(10))
         self.every(DIAGNOSTICS_PERIOD_S, self._publish_diagnostics)
         backward = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
         self._jump = self.get_clock().create_jump_callback(backward, post_callback=self._on_jump)
         if self.managed.autostart:
             self._autostart()
+
+    def _warn_of_unfit_files(self, options: Mapping[str, Any]) -> None:
+        """Say which parameter files of the command line are for other nodes: a misspelt section goes unnoticed."""
+        arguments = [*(options.get("cli_args") or ()), *(sys.argv if options.get("use_global_arguments", True) else ())]
+        name = self.get_fully_qualified_name()
+        for path, names in unfit_files(arguments, name).items():
+            self.log.warning(f"The file {path} has no parameters for {name}. It has some for {', '.join(names)}.")
 
     # What subclasses fill in.
 

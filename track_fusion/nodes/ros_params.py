@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -79,6 +80,59 @@ def _descriptor(name: str, spec: Spec) -> ParameterDescriptor:
         else:
             descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
     return descriptor
+
+
+def refuse_of_others(node: Node, table: Collection[str], choice: str, key: str) -> None:
+    """Check that no parameter of another entry of a table is given; those of an entry are named `<key>.<name>`.
+
+    Raises
+    ------
+    ParameterError    one belongs to an entry that was not chosen
+    """
+    for name in node._parameter_overrides:
+        owner, dot, _ = name.partition(".")
+        if dot and owner != key and owner in table:
+            raise ParameterError(f"The '{name}' parameter belongs to '{owner}', but {choice} is '{key}'.")
+
+
+def unfit_files(arguments: Sequence[str], node: str) -> dict[str, list[str]]:
+    """Return the parameter files of a command line that hold nothing for a node, with the names they do hold.
+
+    Parameters
+    ----------
+    arguments : such as sys.argv
+    node : full name, after remapping
+    """
+    import yaml  # type: ignore[import-untyped]  # comes with rclpy
+
+    unfit, inside = {}, False
+    for word, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        inside = word == "--ros-args" or (inside and word != "--")
+        if inside and word == "--params-file":
+            names = _sections(yaml.safe_load(Path(following).read_text()))
+            if not any(_fits(name.split("/"), node.strip("/").split("/")) for name in names):
+                unfit[following] = names
+    return unfit
+
+
+def _sections(content: Any, above: str = "") -> list[str]:
+    """List the names of the sections of a parameter file; namespaces may be nested."""
+    if not isinstance(content, Mapping):
+        return []
+    names = [above] if "ros__parameters" in content else []
+    inner = {name: below for name, below in content.items() if name != "ros__parameters"}
+    for name, below in inner.items():
+        names += _sections(below, f"{above}/{str(name).strip('/')}".strip("/"))
+    return names
+
+
+def _fits(pattern: Sequence[str], name: Sequence[str]) -> bool:
+    """Match the words of a name: * is any one, ** any number of them."""
+    if not pattern or not name:
+        return not name and all(word == "**" for word in pattern)
+    if pattern[0] == "**":
+        return _fits(pattern[1:], name) or _fits(pattern, name[1:])
+    return pattern[0] in ("*", name[0]) and _fits(pattern[1:], name[1:])
 
 
 def refuse_unknown(node: Node) -> None:

@@ -8,13 +8,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 
 from msg_adapters.arrays import DetectionArrays
 from msg_adapters.detection_table import detection_table_to_msg
 from msg_adapters.header import stamp_to_ns
-from msg_adapters.odometry import odometry_to_msgs
+from msg_adapters.track_table import track_table_to_msg
 from track_fusion.nodes.managed import ManagedNode
 from track_fusion.params import Fault, Params, param, unknown_name_error
 from track_fusion.scenarios import SCENARIOS, get_scenario
@@ -48,7 +47,7 @@ class ScenarioParams(Params):
 
 
 class ScenarioPlayer:
-    """Publishes ~/truth and ~/<sensor>/detections step by step, each after the clock of its time.
+    """Publishes ~/truth, a track table a step, and ~/<sensor>/detections, each after the clock of its time.
 
     Parameters
     ----------
@@ -86,7 +85,7 @@ class ScenarioPlayer:
         self._step, self._steps = 0, params.steps or self._scene.steps
         draw = params.seed, params.run, self._steps
         self._states, self._drawn = self._scene.states(*draw), self._scene.detections(*draw)
-        self._truth = node.publisher(Odometry, "~/truth", depth=100)
+        self._truth = node.publisher(PointCloud2, "~/truth", depth=100)
         self._detections = {name: node.publisher(PointCloud2, f"~/{name}/detections") for name in names}
         self.wanted = dict.fromkeys(self._detections.values(), subscribers_each)
         self.wanted[self._truth] = params.expected_truth_subscribers
@@ -136,8 +135,7 @@ class ScenarioPlayer:
         there = np.flatnonzero(np.isfinite(states).all(1))
         sharp = np.tile(TRUTH_VARIANCE * np.eye(layout.size), (len(there), 1, 1))
         truth = TrackBatch.gaussian(layout, frame_id, states[there], sharp, time_ns=stamp_ns, track_id=1 + there)
-        for msg in odometry_to_msgs(truth, layout.axes):
-            self._truth.publish(msg)
+        self._truth.publish(track_table_to_msg(truth, layout.axes, stamp_ns))
         for name, pub in self._detections.items():
             sensor, z = self._scene.sensors[name], self._drawn[name][self._step - 1]
             noise = np.broadcast_to(sensor.noise, (len(z), *sensor.noise.shape))

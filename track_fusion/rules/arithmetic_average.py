@@ -63,8 +63,10 @@ def fuse(tracks: SourceTracks, params: ArithmeticAverageParams) -> FusedTracks:
     ------
     ValueError    given weights or likelihoods do not fit
 
-    Notes          Weights by diversity, its bound, a target or likelihoods depend on the means, for which the promise
-                   is not proved. The programs (39) and (40) are convex in the weights; at an interior optimum of (40)
+    Notes          Weights by diversity, its bound, a target or likelihoods depend on the means, and then there is no
+                   promise: three scalar tracks of variances 10.4, 10.4 and 6.4, whose errors are 3, 2 and 2 in four
+                   cases of five and else 4, 6 and 4, give by diversity a mean squared error of 1.12 times the
+                   mean claim. The programs (39) and (40) are convex in the weights; at an interior optimum of (40)
                    all divergences (37) are equal. (45) may have several minima; the best found is taken. Where all
                    likelihoods are zero, all tracks weigh the same. O(K n^3).
     References     T. Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average
@@ -146,11 +148,13 @@ RULE = Rule(
     params=ArithmeticAverageParams,
     family="gaussian",
     arity="n_ary",
-    guarantee="conservative",
-    caveat="merged, at weights that do not depend on the means (uniform, given), if every track is",
+    guarantee=lambda params: "conservative" if params.criterion in ("uniform", "given") else "none",
+    caveat="conservative with criterion uniform or given, whose weights do not depend on the means, if every track is; "
+    "else errors of 1.12 times the claim in the example",
     source="Li 2022 (6), (10)-(11), (39), (40), (45)",
     cost="K n^3, about ten times that for weights that are sought with K > 2",
     needs_when=(("target", "criterion", "target"), ("likelihood", "criterion", "likelihood")),
     takes_particles=True,
-    example=Example(({}, *EXAMPLES), (UNIFORM, GIVEN), idempotent=True),
+    takes_phds=True,
+    example=Example(({}, *EXAMPLES), idempotent=True),
 )

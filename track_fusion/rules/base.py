@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from track_fusion import angles
 from track_fusion.densities.mixture.mixture import Mixture as Mixture
 from track_fusion.densities.mixture.mixture import gaussian, moments
 from track_fusion.linalg import Array, asymmetric, is_positive_definite, symmetrise
@@ -32,7 +34,9 @@ class SourceTracks:
     dof : (..., K) or None     degrees of freedom of Student-t tracks; None = all Gaussian
     mixture : Mixture or None  weight (..., K, C), mean (..., K, C, n), cov (..., K, C, n, n);
                                `mean` and `cov` are then its merged moments
-    extras : mapping           what a rule needs beyond the tracks, under the names in its `needs`
+    extras : mapping           what a rule needs beyond the tracks, under the names in its `needs`; densities among
+                               them, a Mixture or several, are in the tracks' axes
+    periods : (n,)             of axes that wrap, infinite for the others; empty: none wraps
     """
 
     mean: Array
@@ -40,11 +44,39 @@ class SourceTracks:
     dof: Array | None = None
     mixture: Mixture | None = None
     extras: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    periods: Sequence[float] = ()
 
     @classmethod
-    def of(cls, densities: Mixture, **extras: Any) -> SourceTracks:
+    def of(cls, densities: Mixture, periods: Sequence[float] = (), **extras: Any) -> SourceTracks:
         """Make tracks of K mixtures (..., K, C); those of one component are Gaussian tracks."""
-        return cls(*moments(densities), mixture=densities if densities.count > 1 else None, extras=extras)
+        mixture = densities if densities.count > 1 else None
+        return cls(*moments(densities, periods), mixture=mixture, extras=extras, periods=periods)
+
+    @property
+    def wraps(self) -> bool:
+        """Whether an axis wraps."""
+        return any(map(math.isfinite, self.periods))
+
+    def relative_to(self, reference: Array) -> SourceTracks:
+        """Tell the tracks, and the densities among the extras, relative to states (..., n): no axis wraps any more.
+
+        Components stay around the mean of their track, also where that lies half a circle away.
+        """
+        mean = angles.difference(self.mean, reference[..., None, :], self.periods)
+
+        def around(densities: Mixture, old: Array, new: Array) -> Mixture:
+            gap = angles.difference(densities.mean, old[..., None, :], self.periods)
+            return dataclasses.replace(densities, mean=new[..., None, :] + gap)
+
+        def extra(value: Any) -> Any:
+            if isinstance(value, Mixture):
+                return around(value.broadcast(self.batch), reference, np.zeros_like(reference))
+            several = isinstance(value, Sequence) and not isinstance(value, str)
+            return [extra(one) for one in value] if several else value
+
+        mixture = self.mixture and around(self.mixture, self.mean, mean)
+        extras = {name: extra(value) for name, value in self.extras.items()}
+        return SourceTracks(mean, self.cov, self.dof, mixture, extras)
 
     @property
     def count(self) -> int:
@@ -96,7 +128,9 @@ class FusedTracks:
     weights : (..., K) or None     fusion weights (omega)
     dof : (...) or None            None = Gaussian
     mixture : Mixture or None      the fused mixture, when the rule keeps one
-    info : mapping                 arrays of diagnostics: `converged`, `iterations`, ...
+    info : mapping                 arrays of diagnostics: `converged`, `iterations`, ...; where axes wrap, also
+                                   `beyond_half_circle` (...): the tracks had no mean direction and were fused about the
+                                   most certain one
     """
 
     mean: Array
@@ -111,6 +145,14 @@ class FusedTracks:
         """The fused mixture, or the Gaussian of the moments, of one component."""
         return gaussian(self.mean, self.cov) if self.mixture is None else self.mixture
 
+    def put_back(self, reference: Array, periods: Sequence[float]) -> FusedTracks:
+        """Undo :meth:`SourceTracks.relative_to`: add the states (..., n), and wrap."""
+        mixture = self.mixture
+        if mixture is not None:
+            mean = angles.shifted(reference[..., None, :], mixture.mean, periods)
+            mixture = dataclasses.replace(mixture, mean=mean)
+        return dataclasses.replace(self, mean=angles.shifted(reference, self.mean, periods), mixture=mixture)
+
 
 Values = Mapping[str, Any]
 #: Stands in an example for one weight a source, unequal and of sum 1.
@@ -122,9 +164,10 @@ class Example:
     """What the laws of `contract` need to know beyond the descriptor: at which parameters a rule is tried, and how."""
 
     params: tuple[Values, ...] = ({},)
-    guaranteed: tuple[Values, ...] = ({},)  # where the guarantee holds
     not_equivariant: tuple[Values, ...] = ()  # where the result depends on axes and units, if the claim is a text
+    ordered: tuple[Values, ...] = ()  # where the order of the sources matters, if the claim is a text
     idempotent: bool | None = None  # whether copies of one track fuse to that track; None: not stated
+    keeps_one: bool = True  # whether one track alone comes back as it is
     #: by how many standard deviations moments may vary with the random numbers, if every sample is effective; where
     #: parameters name a number of samples
     monte_carlo: float = 0.0
@@ -144,11 +187,11 @@ class Rule:
     params: type[Params]
     family: Family
     arity: Arity
-    guarantee: Guarantee
+    guarantee: Guarantee | Callable[[Any], Guarantee]  # at any parameters, or a function of them
     caveat: str  # when the guarantee holds, or what breaks it
     source: str  # paper and equation numbers
     cost: str  # operations a fusion, in K sources of n axes
-    order_matters: bool = False
+    order_matters: bool | str = False  # a string says when
     needs: tuple[str, ...] = ()  # names of `extras`
     #: (extra, parameter, value): needed as well when the parameter has this value, and of no use otherwise
     needs_when: tuple[tuple[str, str, str], ...] = ()
@@ -157,11 +200,12 @@ class Rule:
     optional_when: tuple[tuple[str, str, str], ...] = ()
     affine_equivariant: bool | str = True  # a string says why not, or under which parameters
     takes_particles: bool = False  # components without covariance; the fusion centre gives other rules their Gaussian
+    takes_phds: bool = False  # mixtures whose weights sum to a number of targets, averaged; other rules normalise them
     linear: bool = False  # the fused mean is linear in the means; all else depends on the covariances alone
     example: Example = Example()
 
     def __call__(self, tracks: SourceTracks, params: Params | None = None) -> FusedTracks:
-        """Check the tracks, then fuse them; `fuse` alone trusts them, for callers that screened them before.
+        """Check the tracks, then :meth:`apply` the rule.
 
         Raises
         ------
@@ -172,7 +216,35 @@ class Rule:
         missing = [name for name in self.needed(params) if name not in tracks.extras]
         if missing:
             raise ValueError(f"The rule '{self.key}' needs '{missing[0]}' beside the tracks. Got none.")
-        return self.fuse(tracks, params)
+        return self.apply(tracks, params)
+
+    def apply(self, tracks: SourceTracks, params: Params) -> FusedTracks:
+        """Fuse tracks that were screened before; `fuse` itself knows nothing of axes that wrap.
+
+        Where some wrap, it is given the tracks relative to the most certain of them, and what it returns is put back.
+
+        Raises
+        ------
+        LinAlgError    a covariance is not positive definite
+        """
+        if not tracks.wraps:
+            return self.fuse(tracks, params)
+        reference = angles.most_certain(tracks.mean, tracks.cov)
+        flat = tracks.relative_to(reference)
+        fused = self.fuse(flat, params).put_back(reference, tracks.periods)
+        beyond = ~angles.within_half_circle(flat.mean, tracks.periods)
+        return dataclasses.replace(fused, info={**fused.info, "beyond_half_circle": beyond})
+
+    def guarantee_at(self, params: Params | None = None) -> Guarantee:
+        """Return what is guaranteed at these parameters; None: at their defaults."""
+        if not callable(self.guarantee):
+            return self.guarantee
+        return self.guarantee(self.params() if params is None else params)
+
+    @property
+    def promise(self) -> str:
+        """What is guaranteed, in words."""
+        return f"{self.guarantee_at()} by default" if callable(self.guarantee) else self.guarantee
 
     def uses(self, extra: str, params: Params) -> bool:
         """Tell whether an optional extra makes a difference at these parameters."""
@@ -190,7 +262,7 @@ def check_tracks(tracks: SourceTracks) -> None:
     Raises
     ------
     ValueError    a shape does not fit, no source, a value is not finite, a covariance not symmetric or
-                  not positive definite, dof not above 2, a weight of a mixture negative
+                  not positive definite, dof not above 2, a weight of a mixture negative, a period not positive
     """
     mean, cov = tracks.mean, tracks.cov
     if mean.ndim < 2 or mean.shape[-2] < 1 or mean.shape[-1] < 1:
@@ -206,6 +278,11 @@ def check_tracks(tracks: SourceTracks) -> None:
         raise ValueError(
             f"The 'cov' of source tracks must be positive definite: {(~good).sum()} of {good.size} are not. "
             f"Smallest eigenvalue: {lowest:.3g}."
+        )
+    if tracks.periods and (len(tracks.periods) != mean.shape[-1] or not all(p > 0 for p in tracks.periods)):
+        raise ValueError(
+            f"The 'periods' of source tracks must be {mean.shape[-1]} numbers > 0, infinite where an axis does not "
+            f"wrap. Got {tuple(tracks.periods)}."
         )
     if tracks.dof is not None:
         _check_shape("dof", tracks.dof, mean.shape[:-1])

@@ -279,5 +279,5 @@ RULE = Rule(
     cost="K n^3, about ten times that for K > 2",
     linear=True,
     affine_equivariant="not with criterion trace: the trace depends on the units of the axes",
-    example=Example(EXAMPLES, EXAMPLES, (TRACE,), idempotent=True),
+    example=Example(EXAMPLES, (TRACE,), idempotent=True),
 )

@@ -24,7 +24,7 @@ def fuse(tracks: SourceTracks, params: FaultTolerantCovarianceIntersectionParams
     """Fuse K Gaussian tracks by fault-tolerant convex combination (FFCC): weights that sum to delta <= 1.
 
     Conservative for every cross-correlation, also when the covariances of the tracks are too small by a factor of up
-    to delta.
+    to delta; so one track alone is inflated, too.
 
     Parameters
     ----------
@@ -40,18 +40,17 @@ def fuse(tracks: SourceTracks, params: FaultTolerantCovarianceIntersectionParams
     ValueError     given weights do not fit (they sum to 1 before they are multiplied by delta)
     LinAlgError    a covariance is singular
 
-    Notes          The mean is that of covariance intersection, the covariance P_CI / delta. One track alone comes
-                   back as it is: nothing is combined. O(K n^3).
+    Notes          The mean is that of covariance intersection, the covariance P_CI / delta, of one track P / delta.
+                   O(K n^3).
     References     T. Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average
                    Density Fusion, section II-C, (19).
     """
     fused = covariance_intersection.fuse(tracks, params)
-    if tracks.count == 1 or fused.weights is None:
-        return fused
+    assert fused.weights is not None
     return dataclasses.replace(fused, cov=fused.cov / params.delta, weights=fused.weights * params.delta)
 
 
-HALVED = {**TRACE, "delta": 0.5}
+BY_TRACE = {**TRACE, "delta": 0.75}
 
 RULE = Rule(
     key="fault_tolerant_covariance_intersection",
@@ -61,9 +60,10 @@ RULE = Rule(
     family="gaussian",
     arity="n_ary",
     guarantee="conservative",
-    caveat="if every track is, or is too small by a factor of at most delta; for every cross-correlation",
+    caveat="if every track is, or is too small by a factor of at most delta; for every cross-correlation, and for one "
+    "track, too",
     source="Li 2022 II-C",
     cost="as covariance intersection",
     affine_equivariant="not with criterion trace: the trace depends on the units of the axes",
-    example=Example(({}, HALVED, GIVEN), ({}, GIVEN), (HALVED,), idempotent=False),
+    example=Example(({}, BY_TRACE, GIVEN), (BY_TRACE,), idempotent=False, keeps_one=False),
 )

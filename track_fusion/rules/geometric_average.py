@@ -64,11 +64,9 @@ RULE = Rule(
     params=GeometricAverageParams,
     family="gaussian",
     arity="n_ary",
-    guarantee="conservative",
+    guarantee=lambda params: "conservative" if params.criterion in ("uniform", "given") else "none",
     caveat="at weights that do not depend on the means (uniform, given), if every track is",
     source="Li 2022 (15)-(17); Ahmed (9)-(11)",
     cost="K n^3, about ten times that for weights that are sought",
-    example=Example(
-        ({}, {"criterion": "chernoff"}, {"criterion": "minimax_information_loss"}, GIVEN), ({}, GIVEN), idempotent=True
-    ),
+    example=Example(({}, *SOUGHT, GIVEN), idempotent=True),
 )

@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from track_fusion.densities.mixture.algebra import LogMixture, product
-from track_fusion.densities.mixture.mean_density import fit_mean_density, sample_mean_density
-from track_fusion.densities.mixture.mixture import Mixture, chosen, same
-from track_fusion.params import param
+from track_fusion.densities.mixture.mixture import Mixture
 from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
-from track_fusion.rules.shared.mixtures import AverageParams, ReductionParams, fused_tracks, nth
+from track_fusion.rules.shared.mixtures import AverageParams, fused_tracks, geometric_average
+from track_fusion.rules.shared.sampled_means import MeanSamplingParams, sampled_mean
 from track_fusion.rules.shared.sampling import Generators, fuse_sampled
 from track_fusion.rules.shared.weights import GIVEN
 
 
 @dataclasses.dataclass(frozen=True)
-class GeometricMeanSamplingParams(AverageParams):
+class GeometricMeanSamplingParams(AverageParams, MeanSamplingParams):
     """The fusion weights, the samples and the number of components."""
-
-    samples: int = param(5000, "samples in all", low=10)
-    inflation: float = param(
-        1.0, "alpha: factor on the covariances that samples are drawn from; above 1 it widens the result", low=1.0
-    )
 
 
 def fuse(tracks: SourceTracks, params: GeometricMeanSamplingParams) -> FusedTracks:
@@ -41,9 +30,9 @@ def fuse(tracks: SourceTracks, params: GeometricMeanSamplingParams) -> FusedTrac
 
     Returns
     -------
-    FusedTracks    mean (..., n), cov (..., n, n), weights (..., K), the mixture for mixtures; info ess (share of
-                   samples that are effective), log_eta (log of the integral of the product: very low where the
-                   densities are disjoint)
+    FusedTracks    mean (..., n), cov (..., n, n), weights (..., K), the mixture for mixtures; info converged (false
+                   where no more than 1 % of the samples are effective), ess (share of samples that are), log_eta
+                   (log of the integral of the product: very low where the densities are disjoint)
 
     Raises
     ------
@@ -52,7 +41,9 @@ def fuse(tracks: SourceTracks, params: GeometricMeanSamplingParams) -> FusedTrac
     Notes          Of Gaussian tracks the limit for many samples is covariance intersection at these weights, which is
                    conservative; but each sampled variance errs by about its square root of 2 / S_eff: fifty
                    samples of seed 1 for two tracks of variance 1 claim .765 where the error may have variance 1.
-                   Equal tracks come back. O(K C S n^2) for S samples, of sources far apart few are effective.
+                   Equal tracks come back. Of sources far apart few samples are effective; where 1 % or less are,
+                   mixture_geometric takes the place of the samples, its covariances times `inflation`: of
+                   Gaussians it is covariance intersection. O(K C S n^2) for S samples.
     References     N. Sharma et al., Harmonic Mean Density Fusion in Distributed Tracking: Performance and
                    Comparison, eqs. (61)-(65), (67)-(73).
     """
@@ -60,35 +51,16 @@ def fuse(tracks: SourceTracks, params: GeometricMeanSamplingParams) -> FusedTrac
     def fuse_piece(piece: SourceTracks, rngs: Generators) -> FusedTracks:
         weights = params.shares(piece)
         parts = params.sources(piece).normalised
-        drawn = sample_mean_density(parts, weights, "geometric", rngs[0], params.samples, params.inflation)
-        mixture = fit_mean_density(drawn, _naive_product(parts, params))
-        if params.inflation == 1.0:
-            sole = params.weights.index(1.0) if 1.0 in params.weights else 0
-            mixture = chosen(_all_same(parts) | (weights == 1.0).any(-1), nth(parts, sole), mixture)
-        info: dict[str, NDArray[Any]] = {"ess": drawn.ess / params.samples, "log_eta": drawn.log_eta}
+
+        def closed() -> Mixture:
+            near = geometric_average(piece, weights, params)
+            return dataclasses.replace(near, cov=params.inflation * near.cov)
+
+        mixture, info = sampled_mean(parts, weights, "geometric", params, rngs[0], closed)
         fused = fused_tracks(mixture, weights, info)
         return fused if tracks.mixture is not None else dataclasses.replace(fused, mixture=None)
 
     return fuse_sampled(tracks, tracks.count * params.samples, fuse_piece)
-
-
-def _naive_product(parts: Mixture, params: ReductionParams) -> LogMixture:
-    """Product (..., M) of K mixtures (..., K, C), brought down to `max_components` after each source."""
-    fused = LogMixture.of(nth(parts, 0))
-    for k in range(1, parts.weight.shape[-2]):
-        both = product(fused, LogMixture.of(nth(parts, k)))
-        reduced = params.reduce(both.normalised)
-        fused = LogMixture.of(reduced) if reduced.count < both.mean.shape[-2] else both
-    return fused
-
-
-def _all_same(parts: Mixture) -> NDArray[np.bool_]:
-    """Tell where all K mixtures (..., K, C) are equal, (...)."""
-    first = nth(parts, 0)
-    alike = np.ones(first.weight.shape[:-1], bool)
-    for k in range(1, parts.weight.shape[-2]):
-        alike &= same(first, nth(parts, k))
-    return alike
 
 
 RULE = Rule(

@@ -43,6 +43,10 @@ def fuse(tracks: SourceTracks, params: MixtureAverageParams) -> FusedTracks:
     return fused_tracks(params.reduce(average(params.sources(tracks), weights)), weights)
 
 
+def _reduced(params: MixtureAverageParams) -> bool:
+    return bool(params.max_components or params.max_source_components)
+
+
 RULE = Rule(
     key="mixture_average",
     title="Average of mixtures",
@@ -50,9 +54,10 @@ RULE = Rule(
     params=MixtureAverageParams,
     family="mixture",
     arity="n_ary",
-    guarantee="conservative",
-    caveat="of the merged moments, if every track is; not with reduction cap",
+    guarantee=lambda params: "none" if params.reduction == "cap" and _reduced(params) else "conservative",
+    caveat="of the merged moments, if every track is; not where components are cut off, by reduction cap",
     source="Li 2019 (9)",
     cost="K C n^2 for C components a source, (K C)^2 n^3 to merge them",
-    example=Example(({}, GIVEN, {"max_components": 3}), ({}, GIVEN), idempotent=True),
+    takes_phds=True,
+    example=Example(({}, GIVEN, {"max_components": 3}), idempotent=True),
 )

@@ -45,6 +45,8 @@ def fuse(tracks: SourceTracks, params: MixtureGeometricParams) -> FusedTracks:
     return fused_tracks(geometric_average(tracks, weights, params), weights)
 
 
+REDUCED = {"max_components": 2}
+
 RULE = Rule(
     key="mixture_geometric",
     title="Geometric average of mixtures",
@@ -56,5 +58,6 @@ RULE = Rule(
     caveat="one component: covariance intersection; for several the power is an approximation",
     source="Li 2019 (49)-(51)",
     cost="C^K n^3 for C components a source",
-    example=Example(({}, GIVEN), idempotent=False),
+    order_matters="where the number of components is reduced on the way",
+    example=Example(({}, GIVEN, REDUCED), ordered=(REDUCED,), idempotent=False),
 )

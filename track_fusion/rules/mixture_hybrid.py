@@ -49,6 +49,8 @@ def fuse(tracks: SourceTracks, params: MixtureHybridParams) -> FusedTracks:
     return fused_tracks(Mixture(number[..., None] * where.weight, where.mean, where.cov), weights)
 
 
+REDUCED = {"max_components": 2}
+
 RULE = Rule(
     key="mixture_hybrid",
     title="Hybrid average of PHDs",
@@ -60,5 +62,7 @@ RULE = Rule(
     caveat="one component: covariance intersection; keeps the mean number of targets, not every target",
     source="Li 2019 section 5.2, (49)-(51)",
     cost="C^K n^3 for C components a source",
-    example=Example(({}, GIVEN), idempotent=False),
+    order_matters="where the number of components is reduced on the way",
+    takes_phds=True,
+    example=Example(({}, GIVEN, REDUCED), ordered=(REDUCED,), idempotent=False),
 )

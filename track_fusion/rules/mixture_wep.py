@@ -11,17 +11,11 @@ from numpy.typing import NDArray
 
 from track_fusion.densities.log_domain import log_of, normalised
 from track_fusion.densities.mixture.algebra import LogMixture, first_order, product
+from track_fusion.densities.mixture.exponent import PROPOSAL_OMEGA, Omega, optimise_omega, overlap_proposal
 from track_fusion.densities.mixture.mixture import Mixture, chosen, same, stacked
 from track_fusion.densities.mixture.proposals import prune_mixands
 from track_fusion.densities.mixture.quotient import Laplace, laplace, wep_bound, wep_quotient
-from track_fusion.densities.mixture.sampling import (
-    PROPOSAL_OMEGA,
-    Omega,
-    optimise_omega,
-    overlap_proposal,
-    single_shot_em,
-    weighted_em,
-)
+from track_fusion.densities.mixture.sampling import single_shot_em, weighted_em
 from track_fusion.linalg import Array
 from track_fusion.params import param
 from track_fusion.rules import covariance_intersection
@@ -64,6 +58,12 @@ class MixtureWepParams(WeightParams, QuotientParams):
         "overlap, or without regard to it, as foci and the paper have it (first_order)",
         choices=("overlap", "first_order"),
     )
+    omega_error: float = param(
+        0.02,
+        "the search for omega doubles its samples until two standard errors of omega are no more than this; 1: never",
+        low=0.0, high=1.0, strict=True,
+    )  # fmt: skip
+    max_omega_samples: int = param(64000, "most samples of the search for omega, which starts with 'samples'", low=10)
 
 
 def fuse(tracks: SourceTracks, params: MixtureWepParams) -> FusedTracks:
@@ -80,9 +80,11 @@ def fuse(tracks: SourceTracks, params: MixtureWepParams) -> FusedTracks:
 
     Returns
     -------
-    FusedTracks    mixture; mean (..., n) and cov (..., n, n) are its moments; weights (..., K); info converged,
-                   iterations, ess (least share of samples that are effective), log_eta (log of the integral of the
-                   product: very low for disjoint densities), pruned (bound on the share of weight not sampled)
+    FusedTracks    mixture; mean (..., n) and cov (..., n, n) are its moments; weights (..., K); info converged
+                   (false also where omega_error is larger than asked for), iterations, omega_error (two standard
+                   errors of omega, the largest of several), ess (least share of samples that are effective), log_eta
+                   (log of the integral of the product: very low for disjoint densities), pruned (bound on the
+                   share of weight not sampled)
 
     Raises
     ------
@@ -103,7 +105,7 @@ def fuse(tracks: SourceTracks, params: MixtureWepParams) -> FusedTracks:
             share = None if given is None else share_of_first(given, k)
             return _fuse_pair(first, second, params, rngs[k - 1], share)
 
-        return fold_mixtures(piece, params, step, ("converged", "iterations", "ess", "log_eta", "pruned"))
+        return fold_mixtures(piece, params, step, TOLD)
 
     return fuse_sampled(tracks, params.points(tracks), fuse_piece)
 
@@ -127,8 +129,11 @@ def _sample_pair(
 ) -> Step:
     given = None if share is None else np.full(first.weight.shape[:-1], share)
     proposal = PROPOSALS[params.omega_proposal](first, second)
-    search = optimise_omega(first, second, rng, params.samples, params.criterion, given, proposal)
-    how = {"converged": search.converged, "iterations": search.iterations}
+    search = optimise_omega(
+        first, second, rng, params.samples, params.criterion, given, proposal, params.omega_error,
+        params.max_omega_samples,
+    )  # fmt: skip
+    how = {"converged": search.converged, "iterations": search.iterations, "omega_error": search.error}
     drawn = {"ess": search.samples.ess / params.samples, "log_eta": search.samples.log_eta}
     # At the ends, and of equal sources, one source is the answer; 1/2 keeps the rest finite there.
     ends = (search.omega == 0.0) | (search.omega == 1.0) | same(first, second)
@@ -139,6 +144,8 @@ def _sample_pair(
     return either(ends, answer, Step(fused, omega, how | drawn | more))
 
 
+#: The diagnostics of a fusion.
+TOLD = ("converged", "iterations", "omega_error", "ess", "log_eta", "pruned")
 #: What Algorithm 1 draws from.
 PROPOSALS: dict[str, Callable[[Mixture, Mixture], Mixture]] = {
     "overlap": overlap_proposal,
@@ -171,11 +178,11 @@ def _dls(first: Mixture, second: Mixture, search: Omega, params: MixtureWepParam
     likely = np.broadcast_to((search.samples.log_eta - np.log(bound.shape[-1]))[..., None], bound.shape)
     kept = prune_mixands(wep_quotient(first, second, search.omega), bound, likely, params.prune_nats)
 
-    def wide(near: Laplace) -> Array:
-        above = first_order(first, second, search.omega).cov
-        return np.take_along_axis(above, kept.order[..., None, None], -3)
+    def above(near: Laplace) -> tuple[Array, Array]:
+        whole = first_order(first, second, search.omega).take(kept.order)
+        return whole.mean, whole.cov
 
-    return sample_mixands(kept, first, second, lambda: laplace(kept.quotient), wide, params, rng)
+    return sample_mixands(kept, first, second, lambda: laplace(kept.quotient), above, params, rng)
 
 
 def _igs(first: Mixture, second: Mixture, search: Omega, params: MixtureWepParams, rng: np.random.Generator) -> Result:
@@ -198,7 +205,10 @@ def _pcci(first: Mixture, second: Mixture, search: Omega, params: MixtureWepPara
     fused = rule.fuse(SourceTracks(pairs.mean, pairs.cov), rule.params())
     assert fused.weights is not None
     log_weight = (fused.weights * np.where(fused.weights > 0.0, log_of(pairs.weight), 0.0)).sum(-1)
+    # A component without weight has none in any pair, also where its exponent is 0.
+    log_weight = np.where((pairs.weight > 0.0).all(-1), log_weight, -np.inf)
     info = {"converged": fused.info["converged"].all(-1), "iterations": fused.info["iterations"].sum(-1)}
+    info["omega_error"] = np.zeros(info["converged"].shape)
     return Mixture(normalised(log_weight), fused.mean, fused.cov), info
 
 

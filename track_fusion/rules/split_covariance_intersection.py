@@ -183,5 +183,5 @@ RULE = Rule(
     cost="K n^3, about ten times that for weights that are sought",
     needs=("independent_cov",),
     affine_equivariant="not with criterion trace: the trace depends on the units of the axes",
-    example=Example(EXAMPLES, EXAMPLES, (TRACE,), idempotent=False),
+    example=Example(EXAMPLES, (TRACE,), idempotent=False),
 )

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from track_fusion.angles import difference
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate, armse, rmse
 from track_fusion.rules import FusedTracks
@@ -101,8 +102,9 @@ class OneTargetStudy:
 
     def _keep(self, into: Outcomes, fused: FusedTracks, truth: Array) -> None:
         """Write what one step gives, (R, ...), into views of what is kept of it."""
+        error = difference(fused.mean, truth, self.tracking.layout.periods)
         for q in self.quantities:
-            into[q.error][...] = (fused.mean - truth)[:, q.axes] * q.factor
+            into[q.error][...] = error[:, q.axes] * q.factor
         axes = self.quantities[0].axes
         into[CLAIMED][...] = np.diagonal(fused.cov, axis1=-2, axis2=-1)[:, axes].sum(-1)
         if WEIGHT in into:

@@ -135,3 +135,36 @@ def _gradient_hessian(mean: Array, cov: Array, linear: Array | None) -> Gradient
         return gradient, curvature
 
     return gradient_hessian
+
+
+def merging_weights_by_trace(mean: Array, cov: Array) -> Solution:
+    """Minimise the trace of the inverse of P_AA(w), of a flat batch: (77) of Sharma by the trace, for K tracks.
+
+    Parameters
+    ----------
+    mean : (B, K, n)
+    cov : (B, K, n, n)
+
+    Returns
+    -------
+    Solution    weights (B, K)
+
+    Notes         P_AA is concave in the weights, and the trace of an inverse convex and falling: a convex program.
+    """
+    batch, count, n = mean.shape
+    scale = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1).sum(1))
+    unit = (scale.min(1, keepdims=True) / scale) ** 2  # the trace is in the given units, up to a factor
+    white, points = cov / (scale[:, None, :, None] * scale[:, None, None, :]), mean / scale[:, None]
+
+    def gradient_hessian(w: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
+        x = points[rows]
+        centred = x - np.einsum("bk,bki->bi", w, x)[:, None]
+        spread = white[rows] + centred[..., :, None] * centred[..., None, :]
+        info = np.linalg.inv(np.einsum("bk,bkij->bij", w, spread))[:, None]
+        weigh = info @ (unit[rows, None, :, None] * info)  # M^-1 U M^-1
+        gradient = -(weigh * spread).sum((-2, -1))
+        step = (info @ spread).reshape(len(w), count, n * n)
+        bend = step @ transpose((weigh @ spread).swapaxes(-1, -2).reshape(len(w), count, n * n))
+        return gradient, bend + transpose(bend) + 2.0 * centred @ weigh[:, 0] @ transpose(centred)
+
+    return minimise_on_simplex(gradient_hessian, batch, count)

@@ -10,12 +10,10 @@ from scipy.optimize import minimize
 from track_fusion.densities.mixture.algebra import LogMixture
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments
 from track_fusion.densities.mixture.quotient import (
-    Quotient,
     exact_bound,
     exact_quotient,
     laplace,
     moment_matched,
-    not_integrable,
     wep_bound,
     wep_quotient,
 )
@@ -40,27 +38,6 @@ def test_bounds_are_the_integrals_where_there_is_one_component() -> None:
     product = wep_quotient(one, other, np.array(0.3))
     wanted = mixand_moments(product, 0)[0]
     assert np.exp(wep_bound(one, other, np.array(0.3))[0]) == pytest.approx(wanted, rel=1e-8)
-
-
-def test_integrable_only_if_some_component_is_wider_in_every_direction() -> None:
-    def common(*covs: Array) -> Mixture:
-        return Mixture(np.full(len(covs), 1.0 / len(covs)), np.zeros((len(covs), 2)), np.stack(covs))
-
-    numerator = LogMixture(np.zeros(1), np.zeros((1, 2)), np.eye(2)[None])
-
-    def verdict(denominator: Mixture) -> bool:
-        quotient = Quotient(numerator, ())
-        bound = exact_bound(quotient, denominator)
-        return bool(not_integrable(quotient, denominator, bound.sure)[0])
-
-    assert not verdict(common(2.0 * np.eye(2)))
-    assert verdict(common(0.5 * np.eye(2)))
-    assert verdict(common(np.diag([2.0, 0.5])))
-    # No component alone is wider, but in each direction one of the two is: along (1, 1) the mean of .5 and 1/30.
-    assert not verdict(common(np.diag([30.0, 0.8]), np.diag([0.8, 30.0])))
-    # Along (1, 1) neither is: the mean of 1/30 and 1/.4 exceeds 1.
-    assert verdict(common(np.diag([30.0, 0.4]), np.diag([0.4, 30.0])))
-    assert verdict(common(np.eye(2)))  # flat: a constant has no integral
 
 
 def test_laplace_finds_the_modes_and_their_curvature() -> None:

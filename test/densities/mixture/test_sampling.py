@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from densities.mixture.examples import COMMON, FIRST, SECOND, draw, mixand_moments
 from scipy import integrate
-from scipy.optimize import minimize_scalar
 
+from track_fusion.densities.mixture.exponent import optimise_omega
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments, sample
 from track_fusion.densities.mixture.proposals import (
     Proposal,
@@ -23,11 +23,10 @@ from track_fusion.densities.mixture.quotient import exact_bound, exact_quotient,
 from track_fusion.densities.mixture.sampling import (
     Weighted,
     floored,
-    optimise_omega,
     single_shot_em,
     weighted_em,
 )
-from track_fusion.densities.on_grid import grid, kl_on_grid, moments_on_grid
+from track_fusion.densities.on_grid import grid, moments_on_grid
 from track_fusion.linalg import Array
 
 POINTS = grid(np.array([-40.0]), np.array([40.0]), 4000)
@@ -39,49 +38,6 @@ def _log(mixture: Mixture) -> Array:
 
 def _integral(log_density: Array) -> float:
     return float(np.exp(log_density).sum() * 80.0 / 4000)
-
-
-# Algorithm 1.
-
-
-def _exact_omega(criterion: str) -> float:
-    a, b = _log(FIRST), _log(SECOND)
-    naive = np.exp(a + b) / np.exp(a + b).sum()
-    pull = 0.0 if criterion == "chernoff" else float((naive * (b - a)).sum())
-    return float(minimize_scalar(
-        lambda w: w * pull + np.log(_integral(w * a + (1 - w) * b)), bounds=(0, 1), method="bounded"
-    ).x)  # fmt: skip
-
-
-@pytest.mark.parametrize("criterion", ["chernoff", "minimax_information_loss"])
-def test_omega_is_that_of_quadrature(criterion: str) -> None:
-    found = optimise_omega(FIRST, SECOND, np.random.default_rng(0), 40000, criterion)
-    assert found.converged
-    assert found.omega == pytest.approx(_exact_omega(criterion), abs=0.04)  # four standard errors of 40000 samples
-    w = float(found.omega)
-    wanted = np.log(_integral(w * _log(FIRST) + (1 - w) * _log(SECOND)))
-    assert found.samples.log_eta == pytest.approx(wanted, abs=0.01)
-    mean, cov = moments_on_grid(w * log_pdf(FIRST, POINTS) + (1 - w) * log_pdf(SECOND, POINTS), POINTS)
-    got = found.samples.moments()
-    assert got[0][0] == pytest.approx(mean[0], abs=4 * np.sqrt(cov[0, 0] / float(found.samples.ess)))
-    assert got[1][0, 0] == pytest.approx(cov[0, 0], rel=0.05)
-
-
-def test_chernoff_point_is_equally_far_from_both() -> None:
-    """Ahmed (10), which the paper gives as necessary and sufficient."""
-    w = float(optimise_omega(FIRST, SECOND, np.random.default_rng(0), 40000).omega)
-    logs = log_pdf(FIRST, POINTS), log_pdf(SECOND, POINTS)
-    far = [kl_on_grid(w * logs[0] + (1 - w) * logs[1], log) for log in logs]
-    assert far[0] == pytest.approx(far[1], rel=0.2)
-
-
-def test_importance_weights_of_algorithm_1_are_bounded_at_one_half() -> None:
-    """The square root of a sum is no more than the sum of square roots: target over proposal is at most its mass."""
-    rng = np.random.default_rng(1)
-    first, second = draw(rng, 20, count=4), draw(rng, 20, count=3)
-    found = optimise_omega(first, second, rng, 2000, omega=np.full(20, 0.5))
-    assert (found.samples.log_weight.max(-1) - found.samples.log_eta < np.log(2 * 2 * 12)).all()
-    assert (found.samples.ess > 0.4 * 2000).all()
 
 
 # Algorithm 2.

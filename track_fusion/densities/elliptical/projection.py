@@ -6,12 +6,16 @@ d_k is the squared Mahalanobis distance of the mean from density k.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
+import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from track_fusion.linalg import Array, inverse, matvec, outer, transpose
+from track_fusion.linalg import Array, inverse, matvec, outer, solve, transpose
 
 MAX_STEPS = 200
 #: A step this short, in standard deviations, or this part of the farthest distance, ends a descent.
@@ -20,6 +24,13 @@ SHORT_STEP, ROUNDING = 1e-9, 1e-14
 #: sum of squares is below (2 x)^2 lies where every term is convex, outside which one term alone is larger: no
 #: other minimum is lower.
 CERTAIN = (2.0 * 1.1996786402577339) ** 2
+#: Starts are the intersections of sets of up to n tracks, of as many sizes as give no more sets than this, from one on.
+MOST_STARTS = 170
+#: So many of them, of least sum, are followed down: with four, 4 of 1800 sums over long tracks that contradict each
+#: other ended above a lower minimum.
+DESCENTS = 6
+#: Numbers in a temporary while starts are chosen.
+CHUNK = 100_000
 #: Unsquared criterion: a descent leaves an estimate by this many standard deviations.
 LEAVE = 1e-3
 #: An estimate is the minimum if no descent ends lower than it by more than this part.
@@ -71,11 +82,13 @@ def nearest_mean(mean: Array, cov: Array, pull: Array, squared: bool) -> Project
     LinAlgError    a matrix is singular
 
     Notes         Iteration (47) lowers the sum at every step, since each term is concave in d_k; a step of
-                  Newton's method replaces it where it lowers the sum further. The squared sum is smooth; it starts at
-                  the uniform intersection, and again from every estimate unless the first minimum is
-                  certainly the lowest. The plain sum has a kink at every estimate x_k, where (48) is infinite: x_k
-                  is a local minimum iff sqrt(G' P_k G) <= sqrt(2 c), G the gradient of the other terms. Every
-                  estimate competes, and a descent starts beside each that is none.
+                  Newton's method replaces it where it lowers the sum further. It starts at the intersection of all
+                  tracks, at equal weights, and again at those of up to n tracks, one included, where the sum is
+                  least: long tracks that contradict each other have many local minima, near the places where some
+                  of them cross. Of the squared sum, which is smooth, the first minimum may be certain to be the lowest.
+                  The plain sum has a kink at every estimate x_k, where (48) is infinite: x_k is a local minimum iff
+                  sqrt(G' P_k G) <= sqrt(2 c), G the gradient of the other terms. Every estimate competes, and a
+                  descent starts beside each that is none.
     References    Z. Chen and J. Zhou, Multisensor Estimation Fusion on Statistical Manifold, 2022, eqs.
                   (39)-(48), Theorem 4; weights (46) are those of (48), for squares phi times its derivative.
     """
@@ -128,9 +141,13 @@ class _Terms:
         residual = at[:, None] - self.points
         force = matvec(self.info, residual)
         distance = np.maximum((residual * force).sum(-1), 0.0)
-        z = self.pull[:, None] * distance
+        return _State(self.sums(distance), distance, force)
+
+    def sums(self, distance: Array) -> Array:
+        """Add up what distances (P, ..., K) cost, (P, ...)."""
+        z = self.pull.reshape(-1, *[1] * (distance.ndim - 1)) * distance
         length = np.log1p(z + np.sqrt(z * (z + 2.0)))
-        return _State((length**2 if self.squared else length).sum(-1), distance, force)
+        return np.asarray((length**2 if self.squared else length).sum(-1))
 
     def slopes(self, distance: Array) -> tuple[Array, Array]:
         """Derivatives of each term over z = c d_k: infinite at an estimate if not squared."""
@@ -161,7 +178,7 @@ class _Minimum:
             mine[rows] = theirs
         return self
 
-    def __getitem__(self, rows: NDArray[np.bool_]) -> _Minimum:
+    def __getitem__(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> _Minimum:
         at, *state, snapped, converged, iterations = (array[rows] for array in self._arrays())
         return _Minimum(at, _State(*state), snapped, converged, iterations)
 
@@ -178,28 +195,19 @@ class _Minimum:
 
 def _squared(terms: _Terms) -> _Minimum:
     best = _descend(terms, _intersection(terms, np.ones(terms.points.shape[:2])))
-    for source in range(terms.points.shape[1]):
-        doubtful = np.flatnonzero(best.state.value > CERTAIN)
-        if not len(doubtful):
-            break
-        part = terms[doubtful]
-        other = _descend(part, part.points[:, source])
-        lower = other.state.value < best.state.value[doubtful] * (1.0 - TIE)
-        best = best.replaced(doubtful[lower], other[lower])
-    return best
+    return _restarted(terms, best, np.flatnonzero(best.state.value > CERTAIN))
 
 
 def _unsquared(terms: _Terms, white: Array) -> _Minimum:
     batch, count, _ = terms.points.shape
     best = _descend(terms, _intersection(terms, np.ones((batch, count))))
+    best = _restarted(terms, best, np.arange(batch))
     for source in range(count):
         here = terms.points[:, source]
         direction = _way_down(terms, white, source)
         rows = np.flatnonzero(direction.any(-1))
         if len(rows):
-            other = _descend(terms[rows], here[rows] + LEAVE * direction[rows])
-            lower = other.state.value < best.state.value[rows] * (1.0 - TIE)
-            best = best.replaced(rows[lower], other[lower])
+            best = _better(best, rows, _descend(terms[rows], here[rows] + LEAVE * direction[rows]))
     states = [terms.state(terms.points[:, source]) for source in range(count)]
     source = np.stack([s.value for s in states]).argmin(0)
     here = np.take_along_axis(terms.points, source[:, None, None], 1)[:, 0]
@@ -208,6 +216,69 @@ def _unsquared(terms: _Terms, white: Array) -> _Minimum:
     # The mean is that estimate, not a point reached to rounding, wherever no descent ends lower.
     at_it = snap.state.value <= best.state.value * (1.0 + TIE)
     return best.replaced(np.flatnonzero(at_it), snap[at_it])
+
+
+def _better(best: _Minimum, rows: NDArray[np.intp], other: _Minimum) -> _Minimum:
+    """Put minima of these rows in place of the best that are clearly higher."""
+    lower = other.state.value < best.state.value[rows] * (1.0 - TIE)
+    return best.replaced(rows[lower], other[lower])
+
+
+# Where descents start.
+
+
+def _restarted(terms: _Terms, best: _Minimum, rows: NDArray[np.intp]) -> _Minimum:
+    """Descend from the most promising intersections of few tracks, and keep the best minimum of these rows."""
+    _, count, n = terms.points.shape
+    # At an estimate the plain sum has a kink, which a descent does not leave.
+    sets = _sets(count, n, 1 if terms.squared else 2)
+    if not len(sets):
+        return best
+    for piece in _pieces(rows, len(sets) * n * n):
+        part = terms[piece]
+        starts = _promising(part, sets)
+        kept = starts.shape[1]
+        ends = _descend(part[np.repeat(np.arange(len(piece)), kept)], starts.reshape(-1, n))
+        lowest = ends.state.value.reshape(-1, kept).argmin(1)
+        best = _better(best, piece, ends[np.arange(len(piece)) * kept + lowest])
+    return best
+
+
+@functools.lru_cache
+def _sets(count: int, n: int, least: int) -> Array:
+    """List sets of `least` to n tracks, but never all, as rows (S, K) of zeros and ones, no more than MOST_STARTS."""
+    sizes = range(1, min(n, count - 1) + 1)
+    totals = itertools.accumulate(math.comb(count, size) for size in sizes)
+    few = [size for size, total in zip(sizes, totals, strict=True) if total <= MOST_STARTS and size >= least]
+    chosen = [members for size in few for members in itertools.combinations(range(count), size)]
+    sets = np.zeros((len(chosen), count))
+    for row, members in zip(sets, chosen, strict=True):
+        row[list(members)] = 1.0
+    return sets
+
+
+def _promising(terms: _Terms, sets: Array) -> Array:
+    """Intersections of sets of tracks (S, K) with the least sums, at most DESCENTS a sum, (P, D, n)."""
+    batch, count, n = terms.points.shape
+    flat = terms.info.reshape(batch, count, n * n)
+    force = matvec(terms.info, terms.points)
+    total = (sets @ flat).reshape(batch, len(sets), n, n)
+    starts = solve(total, (sets @ force)[..., None])[..., 0]
+    if len(sets) <= DESCENTS:
+        return starts
+    # (x - x_k)' I_k (x - x_k), multiplied out: its digits are lost where they do not matter.
+    square = outer(starts).reshape(batch, len(sets), n * n) @ transpose(flat)
+    distance = square - 2.0 * starts @ transpose(force) + (terms.points * force).sum(-1)[:, None]
+    value = terms.sums(np.maximum(distance, 0.0))
+    least = np.argpartition(value, DESCENTS, 1)[:, :DESCENTS]
+    return np.take_along_axis(starts, least[..., None], 1)
+
+
+def _pieces(rows: NDArray[np.intp], numbers: int) -> Iterator[NDArray[np.intp]]:
+    """Cut rows, of so many numbers each, into pieces of at most CHUNK numbers."""
+    step = max(1, CHUNK // numbers)
+    for start in range(0, len(rows), step):
+        yield rows[start : start + step]
 
 
 def _way_down(terms: _Terms, white: Array, source: int) -> Array:

@@ -7,6 +7,7 @@ same random numbers, so that a result does not depend on the batch around it.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -60,11 +61,37 @@ def indirect_global_sampling(
 
 
 class Proposal(NamedTuple):
-    """One proposal a mixand: N(mean, scale cov) with equal shares of the scales (..., M, H)."""
+    """One proposal a mixand: N(mean, scale cov) with equal shares of the scales (..., M, H).
+
+    With `above`, the mean (..., M, n) and covariance (..., M, n, n) of another Gaussian, every other sample is drawn
+    from that.
+    """
 
     mean: Array
     cov: Array
     scale: Array
+    above: tuple[Array, Array] | None = None
+
+    def drawn(self, normal: Array) -> Array:
+        """Turn standard normal vectors (M, S, n) into samples (..., M, S, n); scales take turns, and `above` with them.
+
+        So fewer samples still see each of them.
+        """
+        turn = np.arange(normal.shape[-2])
+        stretch = np.sqrt(self.scale)[..., turn % self.scale.shape[-1], None]
+        points = self.mean[..., None, :] + stretch * (normal @ transpose(cholesky(self.cov)))
+        if self.above is None:
+            return points
+        mean, cov = self.above
+        return np.where(turn[:, None] % 2, points, mean[..., None, :] + normal @ transpose(cholesky(cov)))
+
+    def log_pdf(self, points: Array) -> Array:
+        """Log-density at points (..., M, S, n), each mixand's own: (..., M, S)."""
+        near = _log_normals(points, self.mean, self.cov, self.scale)
+        if self.above is None:
+            return near
+        far = _log_normals(points, *self.above, np.ones((*self.scale.shape[:-1], 1)))
+        return np.asarray(np.logaddexp(near, far) - math.log(2.0))
 
 
 def inflated_naive(
@@ -106,6 +133,15 @@ def heavy_tail(part: Laplace, wide: Array) -> Proposal:
     return Proposal(part.mean, part.cov, top[..., None] ** np.linspace(0.0, 1.0, SCALES))
 
 
+def bounded(near: Laplace, mean: Array, cov: Array) -> Proposal:
+    """Heavy tail (54), and for every other sample the Gaussian N(mean, cov) above the mixand, (..., M, n).
+
+    Then no importance weight exceeds twice the bound's mass: what the mode does not show, such as the hole that sharp
+    components of the denominator make in a wide mixand, is sampled too.
+    """
+    return heavy_tail(near, cov)._replace(above=(mean, cov))
+
+
 @dataclasses.dataclass(frozen=True)
 class Local:
     """What Algorithm 5 gives: the fused mixture (..., M), ESS of each mixand (..., M), log of the integral (...)."""
@@ -123,7 +159,7 @@ def direct_local_sampling(
     Parameters
     ----------
     quotient : Quotient      (..., M) mixands, each integrable
-    proposal : Proposal      INGIS, LAGIS or heavy tail, one a mixand
+    proposal : Proposal      INGIS, LAGIS, heavy tail or bounded, one a mixand
     rng, count               generator and number of samples a mixand
     floor : float            smallest covariance, as a share of the numerator's
 
@@ -134,15 +170,11 @@ def direct_local_sampling(
     References    N. R. Ahmed, Algorithm 5, eqs. (35)-(37).
     """
     log_weight, centre, cov = quotient.numerator
-    (*lead, mixands, n), scales = centre.shape, proposal.scale.shape[-1]
-    normal = _standard_normals(rng, mixands, count, n)
-    # Scales take turns, so that fewer samples still see each of them.
-    stretch = np.sqrt(proposal.scale)[..., np.arange(count) % scales, None]
-    x = proposal.mean[..., None, :] + stretch * (normal @ transpose(cholesky(proposal.cov)))
+    *lead, mixands, n = centre.shape
+    x = proposal.drawn(_standard_normals(rng, mixands, count, n))
     log_m = _log_normals(x, centre, cov, np.ones((*log_weight.shape, 1)))
     log_m -= quotient.log_denominator(x.reshape(*lead, mixands * count, n)).reshape(log_m.shape)
-    theta = log_m - _log_normals(x, proposal.mean, proposal.cov, proposal.scale)
-    local = Weighted(x, theta)
+    local = Weighted(x, log_m - proposal.log_pdf(x))
     mean, spread = local.moments()
     weight = log_weight + local.log_eta
     return Local(Mixture(normalised(weight), mean, floored(spread, cov, floor)), local.ess, log_sum_exp(weight))

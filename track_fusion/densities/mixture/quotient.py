@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from track_fusion.densities.log_domain import log_of
 from track_fusion.densities.mixture.algebra import LogMixture, gaussian_quotient, power, product
 from track_fusion.densities.mixture.mixture import LOG_2PI, Factored, Mixture, component_index, take_components
-from track_fusion.linalg import SMALLEST_PIVOT, Array, cholesky, eliminate, matvec, symmetrise, transpose, whitener
+from track_fusion.linalg import Array, cholesky, eliminate, matvec, solve, symmetrise, transpose, whitener
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,10 +65,11 @@ class Bound(NamedTuple):
     """An upper bound on each mixand's integral: log_weight (..., M) includes the mixand's own weight.
 
     `sure` (..., M) tells where one component of the denominator alone makes the mixand integrable; there the
-    mixand lies below a Gaussian of covariance `cov` (..., M, n, n).
+    mixand lies below a Gaussian of `mean` (..., M, n) and covariance `cov` (..., M, n, n).
     """
 
     log_weight: Array
+    mean: Array
     cov: Array
     sure: NDArray[np.bool_]
 
@@ -86,7 +87,8 @@ def exact_bound(quotient: Quotient, common: Mixture) -> Bound:
     gap = matvec(white[..., None, :, :, :], numerator.mean[..., :, None, :] - common.mean[..., None, :, :])
     info = transpose(image) @ image
     rest = np.eye(n) - info
-    positive, logdet, square = eliminate(rest, matvec(transpose(image), gap))
+    pull = matvec(transpose(image), gap)
+    positive, logdet, square = eliminate(rest, pull)
     half_logdet = -np.log(np.diagonal(white, axis1=-2, axis2=-1)).sum(-1)
     log_scale = 0.5 * n * LOG_2PI + half_logdet - log_of(common.weight)
     kappa = log_scale[..., None, :] + 0.5 * ((gap * gap).sum(-1) + square - logdet)
@@ -96,8 +98,10 @@ def exact_bound(quotient: Quotient, common: Mixture) -> Bound:
     tightest = np.take_along_axis(rest, least[..., None, None], -3)[..., 0, :, :]
     safe = np.where(sure[..., None, None], tightest, np.eye(n))
     cov = symmetrise(lower @ np.linalg.solve(safe, transpose(lower)))
+    force = np.take_along_axis(pull, least[..., None], -2)[..., 0, :]
+    mean = numerator.mean + sure[..., None] * matvec(lower, solve(safe, force[..., None])[..., 0])
     bound = np.where(np.isfinite(numerator.log_weight), np.take_along_axis(kappa, least, -1)[..., 0], 0.0)
-    return Bound(numerator.log_weight + bound, cov, sure)
+    return Bound(numerator.log_weight + bound, mean, cov, sure)
 
 
 def wep_bound(first: Mixture, second: Mixture, omega: Array) -> Array:
@@ -107,48 +111,6 @@ def wep_bound(first: Mixture, second: Mixture, omega: Array) -> Array:
     (w_v N_v)^omega (w_r N_r)^(1 - omega): the component of the approximation (49)-(51) of Li 2019.
     """
     return product(power(LogMixture.of(first), omega), power(LogMixture.of(second), 1.0 - omega)).log_weight
-
-
-# Integrability.
-
-
-def not_integrable(quotient: Quotient, common: Mixture, sure: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Tell which mixands (..., M) of an exact quotient have no integral.
-
-    A mixand has one if every direction v has a component t of the denominator with
-    v' (P_z^-1 - P_t^-1) v > 0, so that the numerator falls faster there. That one t does for all v is
-    `sure`; the others are searched for a direction that none makes fall.
-    """
-    bad = np.zeros(sure.shape, bool)
-    for index in zip(*np.nonzero(~sure & np.isfinite(quotient.numerator.log_weight)), strict=True):
-        lower = cholesky(quotient.numerator.cov[index])
-        lead = tuple(0 if s == 1 else i for s, i in zip(common.weight.shape[:-1], index[:-1], strict=True))
-        image = whitener(common.cov[lead][common.weight[lead] > 0.0]) @ lower
-        bad[index] = _has_flat_direction(np.eye(lower.shape[-1]) - transpose(image) @ image)
-    return bad
-
-
-#: Random directions that start the search for one along which a mixand does not fall.
-DIRECTIONS = 256
-
-
-def _has_flat_direction(forms: Array) -> bool:
-    """Tell whether some v has v' A_t v <= 0 for all quadratic forms A_t (T, n, n), to rounding."""
-    n = forms.shape[-1]
-    vectors = np.linalg.eigh(forms)[1]
-    random = np.random.default_rng(0).normal(size=(DIRECTIONS, n))
-    v = np.concatenate([np.swapaxes(vectors, -1, -2).reshape(-1, n), random])
-    for _ in range(50):
-        v /= np.linalg.norm(v, axis=1, keepdims=True)
-        values = np.einsum("si,tij,sj->st", v, forms, v)
-        if (values.max(1) <= SMALLEST_PIVOT).any():
-            return True
-        # Descend along the form that is largest: a step of subgradient descent on the maximum.
-        top = forms[values.argmax(1)]
-        rise = values.max(1)
-        slope = matvec(top, v) - rise[:, None] * v
-        v = v - 0.5 * slope / np.maximum(np.linalg.norm(top, axis=(1, 2)), 1.0)[:, None]
-    return False
 
 
 # The moment-matched denominator, and Laplace's approximation.

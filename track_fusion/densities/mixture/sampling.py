@@ -1,4 +1,4 @@
-"""Algorithms 1 to 3 of Ahmed: weighted samples of a fused mixture, and mixtures learned from them; in the log domain.
+"""Algorithms 2 and 3 of Ahmed: mixtures learned from weighted samples of a fused mixture; in the log domain.
 
 Each is callable by itself, batched over leading axes, and seeded by the generator it is given. All members of a batch
 share the same random numbers, so that a result does not depend on the batch around it.
@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.log_domain import effective_sample_size, log_mean_exp, log_sum_exp, normalised
-from track_fusion.densities.mixture.algebra import LogMixture, power, product
-from track_fusion.densities.mixture.mixture import Factored, Mixture, chosen, sample
+from track_fusion.densities.mixture.algebra import LogMixture
+from track_fusion.densities.mixture.mixture import Factored, Mixture, chosen
 from track_fusion.linalg import Array, cholesky, eliminate, is_positive_definite, outer, symmetrise, transpose, whitener
-from track_fusion.solvers.optimise import minimise_on_interval
 
 
 class Weighted(NamedTuple):
@@ -40,89 +39,6 @@ class Weighted(NamedTuple):
         mean = (share[..., None, :] @ self.points)[..., 0, :]
         centred = self.points - mean[..., None, :]
         return mean, symmetrise(transpose(share[..., None] * centred) @ centred)
-
-
-class Omega(NamedTuple):
-    """What Algorithm 1 gives: omega (...), samples weighted for it, how the search went (...)."""
-
-    omega: Array
-    samples: Weighted
-    converged: NDArray[np.bool_]
-    iterations: NDArray[np.intp]
-
-
-#: Exponent of the proposal of Algorithm 1; the paper's choice.
-PROPOSAL_OMEGA = 0.5
-
-
-def optimise_omega(
-    first: Mixture,
-    second: Mixture,
-    rng: np.random.Generator,
-    count: int,
-    criterion: str = "chernoff",
-    omega: Array | None = None,
-    proposal: Mixture | None = None,
-) -> Omega:
-    """Algorithm 1: find the exponent of the weighted exponential product and samples of it.
-
-    Parameters
-    ----------
-    first, second : Mixture    (..., C1), (..., C2), normalised; the leading axes are equal
-    rng, count                 generator and number of samples
-    criterion : str            chernoff (9), minimax_information_loss (11)
-    omega : (...) or None      given exponent, instead of any criterion
-    proposal : Mixture or None what is drawn from, q (..., C); by default :func:`overlap_proposal`
-
-    Returns
-    -------
-    Omega    the samples' weights are p_i^omega p_j^(1 - omega) / q
-
-    Notes         On fixed samples both criteria are convex and smooth in omega: Newton's method.
-    References    N. R. Ahmed, Decentralized Gaussian Mixture Fusion through Unified Quotient Approximations,
-                  Algorithm 1, eqs. (8)-(11), (18)-(21), kappa of (21) normalised.
-    """
-    drawn = overlap_proposal(first, second) if proposal is None else proposal
-    points = sample(drawn, rng, count).points
-    log_first, log_second = Factored.of(first).log_pdf(points), Factored.of(second).log_pdf(points)
-    log_q = Factored.of(drawn).log_pdf(points)
-    lead = log_q.shape[:-1]
-    converged, iterations = np.ones(lead, bool), np.zeros(lead, np.intp)
-    if omega is None:
-        contrast, base = log_first - log_second, log_second - log_q
-        if criterion == "chernoff":
-            pull = np.zeros(lead)
-        else:
-            naive = normalised(log_first + log_second - log_q)
-            pull = -(naive * contrast).sum(-1)  # kappa of (21)
-        omega, converged, iterations = _minimise(contrast, base, pull)
-    weight = omega[..., None] * log_first + (1.0 - omega[..., None]) * log_second - log_q
-    return Omega(omega, Weighted(points, weight), converged, iterations)
-
-
-def overlap_proposal(first: Mixture, second: Mixture) -> Mixture:
-    """Component-wise product (..., C1 C2) of powers at 1/2, (49)-(51) of Li 2019, for Algorithm 1 to draw from.
-
-    It has the components of (14)-(16) of Ahmed, but weights that count their overlap, and lies above the target at 1/2
-    up to a constant, so that importance weights are bounded there.
-    """
-    powers = power(LogMixture.of(first), PROPOSAL_OMEGA), power(LogMixture.of(second), 1.0 - PROPOSAL_OMEGA)
-    return product(*powers).normalised
-
-
-def _minimise(contrast: Array, base: Array, pull: Array) -> tuple[Array, NDArray[np.bool_], NDArray[np.intp]]:
-    """Minimise omega * pull + log mean exp(omega contrast + base) over [0, 1], arrays (..., S) and (...)."""
-    lead, count = pull.shape, contrast.shape[-1]
-    contrast, base, flat = contrast.reshape(-1, count), base.reshape(-1, count), pull.reshape(-1)
-
-    def derivatives(w: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
-        c = contrast[rows]
-        share = normalised(w[:, None] * c + base[rows])
-        mean = (share * c).sum(-1)
-        return flat[rows] + mean, (share * (c - mean[:, None]) ** 2).sum(-1)
-
-    least = minimise_on_interval(derivatives, flat.size)
-    return least.weights.reshape(lead), least.converged.reshape(lead), least.iterations.reshape(lead)
 
 
 class Learned(NamedTuple):

@@ -86,10 +86,13 @@ class Step(NamedTuple):
 DIAGNOSTICS: dict[str, tuple[Callable[..., NDArray[Any]], float]] = {
     "converged": (np.logical_and, True),
     "iterations": (np.add, 0),
+    "omega_error": (np.maximum, 0.0),
     "ess": (np.minimum, 1.0),
     "log_eta": (np.add, 0.0),
     "pruned": (np.maximum, 0.0),
     "skipped": (np.add, 0),
+    "undecided": (np.add, 0),
+    "least_difference": (np.minimum, 1.0),
 }
 
 

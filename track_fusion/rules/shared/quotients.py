@@ -13,7 +13,9 @@ from track_fusion.densities.log_domain import log_sum_exp
 from track_fusion.densities.mixture.algebra import LogMixture, product
 from track_fusion.densities.mixture.mixture import Mixture, chosen
 from track_fusion.densities.mixture.proposals import (
+    Proposal,
     Pruned,
+    bounded,
     direct_local_sampling,
     heavy_tail,
     inflated_naive,
@@ -32,10 +34,10 @@ class QuotientParams(ReductionParams):
     """How a quotient of mixtures becomes a mixture, and from how many samples."""
 
     proposal: str = param(
-        "heavy_tail",
+        "bounded",
         "what dls samples from: the naive mean with a component's covariance (ingis), Laplace's approximation (lagis), "
-        "or that with heavy tails (heavy_tail)",
-        choices=("ingis", "lagis", "heavy_tail"),
+        "that with heavy tails (heavy_tail), or that and the Gaussian above the mixand in turn (bounded)",
+        choices=("ingis", "lagis", "heavy_tail", "bounded"),
     )
     samples: int = param(1000, "samples in all, for whatever is not sampled mixand by mixand", low=10)
     mixand_samples: int = param(100, "samples for dls, each mixand", low=10)
@@ -62,7 +64,7 @@ def sample_mixands(
     first: Mixture,
     second: Mixture,
     approximate: Callable[[], Laplace],
-    wide: Callable[[Laplace], Array],
+    above: Callable[[Laplace], tuple[Array, Array]],
     params: QuotientParams,
     rng: np.random.Generator,
 ) -> tuple[Mixture, dict[str, NDArray[Any]]]:
@@ -72,7 +74,7 @@ def sample_mixands(
     ----------
     kept : Pruned            (..., P) mixands
     approximate : callable   () -> Laplace's approximation of these mixands, for the proposals that need it
-    wide : callable          it -> covariances (..., P, n, n) of the Gaussians above the mixands, for heavy tails
+    above : callable         it -> means (..., P, n) and covariances (..., P, n, n) of the Gaussians above the mixands
     params, rng              proposal, number of samples, generator
 
     Returns
@@ -83,10 +85,18 @@ def sample_mixands(
         proposal = inflated_naive(kept.quotient, first, second, params.default_variance, kept.order)
     else:
         near = approximate()
-        proposal = laplace_proposals(near) if params.proposal == "lagis" else heavy_tail(near, wide(near))
+        proposal = PROPOSALS[params.proposal](near, *above(near))
     local = direct_local_sampling(kept.quotient, proposal, rng, params.mixand_samples)
     ess = (local.mixture.weight * local.ess).sum(-1) / params.mixand_samples
     return local.mixture, {"ess": ess, "log_eta": local.log_eta, "pruned": kept.share}
+
+
+#: What dls samples from, of Laplace's approximation and of the means and covariances above the mixands.
+PROPOSALS: dict[str, Callable[[Laplace, Array, Array], Proposal]] = {
+    "lagis": lambda near, mean, cov: laplace_proposals(near),
+    "heavy_tail": lambda near, mean, cov: heavy_tail(near, cov),
+    "bounded": bounded,
+}
 
 
 def multiply(first: Mixture, second: Mixture) -> Step:

@@ -66,7 +66,9 @@ SHOWN_PROBLEMS = 40
 def _choice(key: str, variant: str, **values: Any) -> RuleChoice:
     common: dict[str, Any] = {"max_components": 0}
     if key == "mixture_wep":
+        # As the paper has it, omega is sought on one set of samples, whatever its error.
         common |= {"criterion": "minimax_information_loss", "samples": OMEGA_SAMPLES, "omega_proposal": "first_order"}
+        common["omega_error"] = 1.0
     return RuleChoice(key, from_dict(RULES[key].params, common | values), variant)
 
 

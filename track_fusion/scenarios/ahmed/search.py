@@ -63,12 +63,13 @@ DLS = MixtureExactParams(
     method="dls", proposal="ingis", default_variance=0.5, mixand_samples=500, max_components=COMPONENTS,
     not_integrable="skip",
 )  # fmt: skip
+WEP = MixtureWepParams(method="dls", proposal="heavy_tail", max_components=COMPONENTS, omega_error=1.0)
 RULE_CHOICES = (
     RuleChoice("mixture_exact", DLS),
     RuleChoice("mixture_exact", dataclasses.replace(DLS, proposal="heavy_tail"), "heavy_tail"),
     RuleChoice("mixture_exact", dataclasses.replace(DLS, method="igs", samples=2000), "igs"),
     RuleChoice("mixture_exact", dataclasses.replace(DLS, method="mmgd"), "mmgd"),
-    RuleChoice("mixture_wep", MixtureWepParams(method="dls", max_components=COMPONENTS)),
+    RuleChoice("mixture_wep", WEP),
     RuleChoice("mixture_wep", MixtureWepParams(method="naive_bayes", max_components=COMPONENTS), "naive_bayes"),
 )
 #: The centre; robot 3 before it hears of the others; the quotient of the robots' mixtures itself, on the grid.

@@ -60,7 +60,7 @@ class Setting:
         params = choice.params
         if isinstance(params, EllipticalParams) and params.family != "gaussian" and self.dof is None:
             params = dataclasses.replace(params, family="generalized_gaussian", beta=self.beta)
-        fused = choice.rule.fuse(self.tracks, params)
+        fused = choice.rule.apply(self.tracks, params)
         return np.array([fused.mean[0], fused.cov[0, 0] / self.family.kappa])
 
     def from_barycenter(self, fused: Array) -> float:
