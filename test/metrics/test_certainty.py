@@ -32,6 +32,14 @@ def test_a_few_runs_prove_nothing_and_equal_ones_all():
     assert not surely_positive(-np.ones(LEAST_RUNS))
 
 
+def test_ten_runs_far_above_zero_are_sure_however_skewed():
+    """Where the spread is a thousandth of the mean its shape does not matter."""
+    skewed = np.array([0.0] * 9 + [1.0])
+    for values in (skewed, -skewed):
+        assert surely_positive(1000.0 + values)
+        assert not surely_positive(0.05 + values)
+
+
 def test_a_mean_that_a_few_large_runs_make_is_not_sure():
     """The t interval alone would say yes: 4 of 40 runs make the mean, against all others."""
     values = np.where(np.arange(40) < 10, 8.0, -0.5) + 1e-3 * np.arange(40)

@@ -108,17 +108,19 @@ def test_cubature_filters_under_rules_that_the_user_names():
     found = li2022_nonlinear.SCENARIO.compare([choice], [3], 1, lambda share: None)
     _, _, truth, seen = drawn(tracking, [3], 1)
     one = Plain(Cubature())
-    mean, cov, squares = tracking.initial_mean, tracking.initial_cov, []
+    mean, cov, squares, claimed = tracking.initial_mean, tracking.initial_cov, [], []
     for k in range(tracking.steps):
         mean, cov = one.predict(mean, cov, tracking.motion.over(tracking.dt_s))
         local = [one.update(mean, cov, z[0, k], s)[:2] for z, s in zip(seen, tracking.sensors.values(), strict=True)]
         fused = rule(SourceTracks(np.stack([m for m, _ in local]), np.stack([c for _, c in local])))
         mean, cov = fused.mean, fused.cov
         squares.append((mean - truth[0, k + 1]) ** 2)
+        claimed.append(cov[[0, 1], [0, 1]].sum())
     position, velocity, turn = np.sqrt(
         np.mean(squares, 0) @ np.array([[1, 1, 0, 0, 0], [0, 0, 1, 1, 0], [0] * 4 + [1]]).T
     )
-    assert list(found) == [
-        f"ckf-mhdp_explicit@mine/{q}" for q in ("position_rmse_m", "velocity_rmse_mps", "turn_rate_rmse_degps")
-    ]
-    np.testing.assert_allclose(np.concatenate(list(found.values())), [position, velocity, np.degrees(turn)], rtol=1e-6)
+    names = ("position_rmse_m", "velocity_rmse_mps", "turn_rate_rmse_degps", "consistency_position_1")
+    assert list(found) == [f"ckf-mhdp_explicit@mine/{q}" for q in names]
+    *errors, consistency = found.values()
+    np.testing.assert_allclose(np.concatenate(errors), [position, velocity, np.degrees(turn)], rtol=1e-6)
+    assert consistency == pytest.approx(position**2 / np.mean(claimed), rel=1e-6)

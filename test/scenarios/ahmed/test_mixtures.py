@@ -87,13 +87,19 @@ def test_a_proposal_that_counts_overlaps_needs_fewer_samples(study: dict[str, Es
 
 @pytest.mark.slow
 def test_claims_about_the_study_are_judged_as_the_errata_say(study: dict[str, Estimate]) -> None:
-    found = {c["claim"]: c["verdict"] for c in judged_claims(ahmed_random.SCENARIO, study)}
+    found = {c["claim"]: c for c in judged_claims(ahmed_random.SCENARIO, study)}
     for kind in ("exact", "WEP"):
-        assert found[f"{kind} fusion by DLS improves with the samples"] == "agrees"
-        assert found[f"{kind} fusion by IGS improves with the samples"] == "agrees"
+        for method in ("DLS", "IGS"):
+            claim = found[f"{kind} fusion by {method} improves with the samples"]
+            medians = list(claim["evidence"].values())
+            assert medians == sorted(set(medians))
+            assert claim["verdict"] in ("agrees", "undecided")  # twenty problems tell of some steps only
     each = "(judged: with each of their numbers of samples)"
-    assert found[f"exact fusion: DLS and IGS improve on MMGD {each}"] == "agrees"
-    assert found[f"WEP fusion: DLS and IGS improve on FOCI {each}"] == "contradicts"
+    assert found[f"exact fusion: DLS and IGS improve on MMGD {each}"]["verdict"] == "agrees"
+    foci = found[f"WEP fusion: DLS and IGS improve on FOCI {each}"]
+    *sampled, rough = foci["evidence"].values()
+    assert max(sampled) > rough
+    assert foci["verdict"] == "undecided"
 
 
 def test_times_alone_differ_from_call_to_call_and_pieces_equal_the_whole() -> None:

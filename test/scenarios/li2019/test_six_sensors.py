@@ -155,7 +155,12 @@ def test_two_targets_are_mixed_when_half_way_is_higher():
 def test_claims(measured):
     judged = judged_claims(SCENARIO, measured)
     assert len(judged) == len(SCENARIO.claims)
-    assert [c["claim"][:34] for c in judged if c["verdict"] != "agrees"] == ["A target that one sensor misses is"]
+    others = {c["claim"][:34]: c["verdict"] for c in judged if c["verdict"] != "agrees"}
+    # That none of sixty trials mixes two targets leaves room for one in nine.
+    assert others == {
+        "A target that one sensor misses is": "contradicts", "It mixes the targets at 20 and 40 ": "undecided",
+        "The more sensors, the more targets": "undecided",
+    }  # fmt: skip
     assert measured[f"{EXACT}/lost_targets_1"].value < measured[f"{GA}/lost_targets_1"].value
     assert measured[f"{EXACT}/lost_missed_by_0_share_1"].value < 0.05  # only the approximation loses what all see
     shares = [measured[f"{GA}/lost_missed_by_{k}_share_1"].value for k in range(3)]

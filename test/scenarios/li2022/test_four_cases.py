@@ -43,7 +43,7 @@ def test_the_assumed_pair_has_the_printed_weight(measured):
     assert found.x == pytest.approx(0.3764, abs=5e-5)
     judged = {f["name"]: f["verdict"] for f in judged_figures(SCENARIO, measured)}
     assert len(SCENARIO.published) == 4
-    assert all(judged[name] == "agrees" for name in SCENARIO.published)
+    assert all(judged[name] == "by construction" for name in SCENARIO.published)
 
 
 def test_every_rule_that_two_tracks_are_enough_for_has_a_row(measured):
@@ -129,9 +129,9 @@ def test_pictures_show_all_rules_in_all_cases(outcomes):
 def test_compare():
     choices = [RuleChoice(key, RULES[key].params()) for key in ("naive", "geometric_mean_sampling")]
     found = SCENARIO.compare(choices, [1, 2], 0, lambda share: None)
-    assert list(found) == [f"given-{c.key}/trace_case_{case}_m2" for c in choices for case in SEPARATIONS]
+    assert list(found) == [f"given-{c.key}/claimed_trace_case_{case}_m2" for c in choices for case in SEPARATIONS]
     assert all(values.shape == (2,) for values in found.values())
-    drawn = found["given-geometric_mean_sampling/trace_case_a_m2"]
+    drawn = found["given-geometric_mean_sampling/claimed_trace_case_a_m2"]
     assert drawn[0] != drawn[1]
     with pytest.raises(ParameterError, match="which needs 'common'"):
         SCENARIO.compare([RuleChoice("mixture_exact", RULES["mixture_exact"].params())], [0], 0, lambda share: None)

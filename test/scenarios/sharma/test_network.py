@@ -17,7 +17,7 @@ from track_fusion.scenarios.sharma import network_2 as sharma_network_2
 from track_fusion.scenarios.sharma.network import RULE_CHOICES, figures
 from track_fusion.study.rule_choice import RuleChoice
 
-RUNS = 12000
+RUNS = 20_000
 MODULES = {"1": sharma_network_1, "2": sharma_network_2}
 #: Trace reported and trace of the errors' covariance at the sink.
 ERRATA = {

@@ -13,7 +13,7 @@ from track_fusion.scenarios.sharma import scalar as sharma_scalar
 from track_fusion.scenarios.sharma.scalar import RULE_CHOICES, SCENARIO, SETTINGS, STEPS, figures, simulate
 from track_fusion.study.rule_choice import RuleChoice
 
-RUNS = 100
+RUNS = 200
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,9 @@ def test_charts_show_the_weights_over_the_steps(outcomes):
 def test_compare_takes_any_rule_and_refuses_what_needs_more(outcomes):
     choices = (RuleChoice("naive", NaiveParams()), RULE_CHOICES[-1])
     found = SCENARIO.compare(choices, range(RUNS), 1, lambda share: None)
-    assert len(found) == 2 * len(SETTINGS)
+    assert len(found) == 2 * 2 * len(SETTINGS)  # errors and their consistency
+    consistency = found["kf-harmonic_mean/consistency_q1_rho0_1"]
+    np.testing.assert_allclose(consistency, outcomes["kf-harmonic_mean@q1_rho0/nees"].mean(1))
     name = SETTINGS[4].name
     np.testing.assert_allclose(
         found[f"kf-harmonic_mean/rmse_{name}_1"] ** 2, outcomes[f"kf-harmonic_mean@{name}/square"].mean(1)
