@@ -77,6 +77,14 @@ class TrackLike(Protocol):
         """Whether weights need not sum to 1."""
 
 
+class MergedLike(TrackLike, Protocol):
+    """Tracks that know their moments, for messages that carry one Gaussian a track; the library's TrackBatch does."""
+
+    @property
+    def moments(self) -> tuple[Floats, Floats]:
+        """Mean (N, n) and covariance (N, n, n) of each track, its mixture merged, angles on the circle."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class TrackArrays:
     """N tracks of C components as decoded from a message; values are not judged here.
@@ -141,35 +149,3 @@ class DetectionArrays:
     time_ns: int
     value: Floats
     cov: Floats | None
-
-
-#: The axes that wrap at pi, radians.
-ANGLES = frozenset({"yaw", "bearing", "elevation"})
-
-
-def merged(tracks: TrackLike, axes: Sequence[str]) -> tuple[Floats, Floats]:
-    """Merge the components of each track for a message that carries one Gaussian a track.
-
-    Angular axes are averaged as deviations from the first component, so that a track which points
-    along the cut at pi is not turned around.
-
-    Parameters
-    ----------
-    tracks : TrackLike          N tracks of C components, n axes
-    axes : sequence of str      the names of the n axes
-
-    Returns
-    -------
-    mean (N, n), cov (N, n, n)     SI units; with one component these are its own, untouched
-    """
-    if tracks.mean.shape[1] == 1:
-        return tracks.mean[:, 0], tracks.cov[:, 0]
-    weight = tracks.weight / tracks.weight.sum(1, keepdims=True)
-    first = tracks.mean[:, 0]
-    away = tracks.mean - first[:, None]
-    angular = np.array([a in ANGLES for a in axes])
-    away[..., angular] = np.remainder(away[..., angular] + np.pi, 2 * np.pi) - np.pi
-    shift = np.einsum("nc,nci->ni", weight, away)
-    spread = away - shift[:, None]
-    cov = np.einsum("nc,ncij->nij", weight, tracks.cov + spread[..., :, None] * spread[..., None, :])
-    return first + shift, cov

@@ -11,7 +11,7 @@ from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from msg_adapters.arrays import Floats, TrackLike, merged
+from msg_adapters.arrays import Floats, MergedLike
 from msg_adapters.header import NS_PER_S, make_header
 from msg_adapters.orientation import from_matrix
 
@@ -24,7 +24,7 @@ _SHAFT_M, _HEAD_M, _TEXT_M = 0.1, 0.25, 0.5
 
 
 def markers_to_msg(
-    tracks: TrackLike,
+    tracks: MergedLike,
     axes: Sequence[str],
     stamp_ns: int,
     *,
@@ -40,7 +40,7 @@ def markers_to_msg(
 
     Parameters
     ----------
-    tracks : TrackLike      N tracks, mixtures are merged
+    tracks : MergedLike     N tracks, mixtures are merged
     axes : sequence of str  must have x and y; the arrow needs vx and vy
     stamp_ns : int          header.stamp
     sigmas : float          half-axes of the ellipse in standard deviations
@@ -56,7 +56,7 @@ def markers_to_msg(
         raise ValueError(f"The axes must include x and y to be drawn. Got {tuple(axes)!r}.")
     header = make_header(stamp_ns, tracks.frame_id)
     out = [Marker(header=header, ns=namespace, action=Marker.DELETEALL)]
-    mean, cov = merged(tracks, axes)
+    mean, cov = tracks.moments
     drawn = np.flatnonzero(np.isfinite(mean).all(1) & np.isfinite(cov).all((1, 2)))
     position, spread = _picked(axes, ("x", "y", "z"), mean[drawn], cov[drawn])
     velocity, _ = _picked(axes, ("vx", "vy", "vz"), mean[drawn], cov[drawn])

@@ -17,7 +17,7 @@ import numpy as np
 from geometry_msgs.msg import Point, Pose, PoseWithCovariance, Twist, TwistWithCovariance, Vector3
 from nav_msgs.msg import Odometry
 
-from msg_adapters.arrays import CrossBlock, Floats, MessageError, TrackArrays, TrackLike, merged, one_track, slots_of
+from msg_adapters.arrays import CrossBlock, Floats, MergedLike, MessageError, TrackArrays, one_track, slots_of
 from msg_adapters.header import make_header, stamp_to_ns
 from msg_adapters.orientation import from_yaw, rotation_matrix, unit_quaternion, yaw_of, yaw_rotations
 
@@ -45,7 +45,7 @@ class OdometryReading(NamedTuple):
 
 
 def odometry_to_msgs(
-    tracks: TrackLike,
+    tracks: MergedLike,
     axes: Sequence[str],
     child_prefix: str = "",
     unobserved_variance: float = UNOBSERVED_VARIANCE,
@@ -54,7 +54,7 @@ def odometry_to_msgs(
 
     Parameters
     ----------
-    tracks : TrackLike             N tracks, SI units
+    tracks : MergedLike            N tracks, SI units
     axes : sequence of str         the names of the n axes; those which the message has no place for are left out
     child_prefix : str             such as "track_"
     unobserved_variance : float    variance of the message's axes that are not in `axes` (m^2, rad^2, ...);
@@ -72,7 +72,7 @@ def odometry_to_msgs(
     if not have:
         raise ValueError(f"The axes must include one of {', '.join(_SLOT)}. Got {tuple(axes)!r}.")
     slots = np.array([_SLOT[axes[k]] for k in have])
-    track_mean, track_cov = merged(tracks, axes)
+    track_mean, track_cov = tracks.moments
     mean = np.zeros((len(track_mean), _SIZE))
     cov = np.zeros((len(mean), _SIZE, _SIZE))
     cov[:] = unobserved_variance * np.eye(_SIZE)

@@ -54,7 +54,7 @@ def assert_equal(a: TrackBatch, b: TrackBatch) -> None:
 
 
 def test_layout_knows_units_angles_and_groups() -> None:
-    layout = StateLayout(("vx", "x", "yaw", "y", "turn_rate", "length"))
+    layout = StateLayout(("vx", "x", "yaw", "y", "turn_rate", "charge"))
     assert layout.size == 6
     assert layout.units == ("m/s", "m", "rad", "m", "rad/s", "")
     assert layout.angular.tolist() == [False, False, True, False, False, False]

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from track_fusion import angles
 from track_fusion.layouts import StateLayout as StateLayout
 from track_fusion.layouts import planar_layout as planar_layout
 from track_fusion.linalg import (
@@ -18,7 +19,6 @@ from track_fusion.linalg import (
     Array,
     is_positive_definite,
     is_well_conditioned,
-    merged_moments,
     symmetrise,
     transpose,
 )
@@ -224,23 +224,24 @@ class TrackBatch:
         return self.replace(weight=weight, **fill)
 
     def to_axes(self, layout: StateLayout) -> TrackBatch:
-        """Reorder or marginalise to the axes of another layout.
+        """Reorder or marginalise to the axes of another layout; an axis may wrap there that did not, or sooner.
 
         Raises
         ------
-        ValueError    an axis is missing
+        ValueError    an axis is missing, or its period no multiple of the other layout's
         """
         if layout == self.layout:
             return self
-        at = np.array(self.layout.indices(layout.axes))
-        return self.replace(layout=layout, mean=self.mean[..., at], cov=self.cov[..., at[:, None], at])
+        at = np.array(self.layout.into(layout))
+        mean = angles.wrap(self.mean[..., at], layout.periods)
+        return self.replace(layout=layout, mean=mean, cov=self.cov[..., at[:, None], at])
 
     @cached_property
     def moments(self) -> tuple[Array, Array]:
         """Mean (N, n) and covariance (N, n, n) of each track, its mixture merged."""
         if self.components == 1:
             return self.mean[:, 0], self.cov[:, 0]
-        return merged_moments(self.mean, self.cov, self.weight / self.weight.sum(1, keepdims=True))
+        return angles.moments(self.weight, self.mean, self.cov, self.layout.periods)
 
     @cached_property
     def well_conditioned(self) -> NDArray[np.bool_]:

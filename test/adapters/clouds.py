@@ -12,6 +12,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 
 from msg_adapters.arrays import TrackArrays
 from msg_adapters.header import make_header
+from track_fusion import angles
 
 FORMATS = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}
 U1, U4, F4, F8 = PointField.UINT8, PointField.UINT32, PointField.FLOAT32, PointField.FLOAT64
@@ -80,8 +81,19 @@ def check_track_columns(tracks: TrackArrays) -> None:
     assert tracks.frame_id == "map"
 
 
+class Tracks(TrackArrays):
+    """Arrays that know their moments, as those of the library do."""
+
+    @property
+    def moments(self) -> tuple[Any, Any]:
+        """Mean (N, n) and covariance (N, n, n)."""
+        if self.mean.shape[1] == 1:
+            return self.mean[:, 0], self.cov[:, 0]
+        return angles.moments(self.weight, self.mean, self.cov, angles.periods_of(self.axes))
+
+
 def make_tracks(count: int = 3, components: int = 1, axes: Sequence[str] = ("x", "y", "vx", "vy"), seed: int = 0,
-                **fields: Any) -> TrackArrays:  # fmt: skip
+                **fields: Any) -> Tracks:  # fmt: skip
     """Make valid random tracks."""
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(count, components, len(axes), len(axes)))
@@ -93,7 +105,7 @@ def make_tracks(count: int = 3, components: int = 1, axes: Sequence[str] = ("x",
         "status": rng.integers(0, 8, count, np.uint8), "existence": rng.uniform(0, 1, count),
         "dof": np.full(count, np.inf),
     }  # fmt: skip
-    return TrackArrays(axes=tuple(axes), frame_id="map", **{**values, **fields})
+    return Tracks(axes=tuple(axes), frame_id="map", **{**values, **fields})
 
 
 def live(tracks: TrackArrays, track: int) -> list[tuple[float, list[float], list[list[float]]]]:

@@ -633,7 +633,7 @@ def test_a_turning_target_is_predicted_along_its_turn():
     np.testing.assert_allclose(fused.mean[0, 0], [radius, radius, 0.0, 10.0, np.pi / 8], atol=1e-9)
     transition = motion.over(4.0)
     slope = transition.jacobian(state[0])
-    np.testing.assert_allclose(fused.cov[0, 0], 1e-4 * slope @ slope.T + transition.noise, rtol=1e-10)
+    np.testing.assert_allclose(fused.cov[0, 0], 1e-4 * slope @ slope.T + transition.noise(state[0]), rtol=1e-10)
 
 
 def test_a_rule_that_samples_goes_on_in_its_stream_and_begins_anew_after_reset():

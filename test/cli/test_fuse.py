@@ -176,7 +176,7 @@ def test_in_a_process_of_its_own() -> None:
         ('{"tracks": null}', "tracks: must be a list of tracks; got null"),
         ('{"tracks": [3]}', "tracks[0]: must be an object in braces; got 3"),
         ('{"tracks": [], "tracks": []}', "tracks: is given twice in one object"),
-        ('{"trakcs": []}', "trakcs: is unknown. Did you mean 'tracks'? Valid: tracks"),
+        ('{"trakcs": []}', "trakcs: is unknown. Did you mean 'tracks'? Valid: tracks, axes, angular"),
         ('{"tracks": [{}]}', "tracks[0].mean: is missing"),
     ],
 )  # fmt: skip

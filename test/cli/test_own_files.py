@@ -116,7 +116,7 @@ def test_the_own_scenario_is_judged(examples: Path, tmp_path: Path) -> None:
     # Variances 1 and 1.28, of which .64 is common: w = 1.28 / 2.28, claimed 1.28 / 2.28.
     assert figures["given-naive/credibility_1"]["value"] == pytest.approx(0.5614 / 0.8766, rel=0.1)
     assert figures["given-covariance_intersection/credibility_1"]["value"] == pytest.approx(1.0, rel=0.1)
-    assert [c["verdict"] for c in answer["claims"]] == ["agrees"]
+    assert [c["verdict"] for c in answer["claims"]] == ["agrees", "agrees"]
 
 
 def compared(*words: str) -> dict[str, Any]:

@@ -17,8 +17,12 @@ from xml.etree import ElementTree
 import pytest
 from cli.runner import DEADLINE_S, ROOT, refusal, run, strict_json
 
-VERDICTS = {"agrees", "ordering only", "does not reproduce", "not given"}
+VERDICTS = {"agrees", "contradicts", "undecided", "by construction", "not given"}
 NAME = re.compile(r"^[a-z0-9]+-[a-z0-9_]+(@[a-z0-9_]+)?/[a-z0-9_]+_[a-z0-9]+$")
+
+
+#: A line a scenario that is done, where stderr is no terminal.
+TOLD = re.compile(r"^\S+: \d+ runs?, \d+\.\d s of one processor$")
 
 
 #: A scenario that takes no time; its file notes what it is asked for.
@@ -27,7 +31,8 @@ from pathlib import Path
 import numpy as np
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.study.chart import Chart, Series
-from track_fusion.study.scenario import Claim, Scenario
+from track_fusion.study.claim import Claim
+from track_fusion.study.scenario import Scenario
 
 def simulate(runs, seed, progress, only=""):
     Path(__file__).with_suffix(f".asked-{seed}-{runs.start}-{runs.stop}").touch()
@@ -35,9 +40,11 @@ def simulate(runs, seed, progress, only=""):
 
 def figures(outcomes):
     runs = len(outcomes["heads"])
+    swing = np.where(np.arange(runs) < runs / 2, 1.0, -1.0) * np.sqrt((runs - 1) / runs)  # spread 1, mean 0 if even
     return {
-        "kf-alone/error_m": Estimate(1.0, 0.01, runs),
-        "kf-ic/error_m": Estimate(9.0, 0.01, runs),
+        "kf-alone/error_m": Estimate.mean(1.0 + 0.01 * np.sqrt(runs) * swing),
+        "kf-ic/error_m": Estimate.mean(9.0 - 0.01 * np.sqrt(runs) * swing),
+        "kf-alone/luck_1": Estimate.mean(0.3 + swing),
         "kf-naive/error_m": Estimate(2.0, float("nan"), runs),
         "kf-sum/heads_1": Estimate.exact(outcomes["heads"].sum()),
     }
@@ -50,8 +57,11 @@ SCENARIO = Scenario(
     simulate=simulate, figures=figures, charts=charts,
     published={"kf-alone/error_m": 1.01, "kf-ic/error_m": 0.5}, published_runs=10, default_runs=RUNS,
     publication_runs=900, assumptions=("it is fair",), claims=(
-        Claim("heads & tails are rare", "Fig. 1", ("kf-sum/heads_1",), lambda e: e.value < 0),
+        Claim.below("heads & tails are rare", "Fig. 1", 0.0, "kf-sum/heads_1"),
+        Claim.order("all is better than one", "Fig. 2", "kf-alone/error_m", "kf-ic/error_m"),
         Claim.order("naive lies between", "Fig. 2", "kf-alone/error_m", "kf-naive/error_m", "kf-ic/error_m"),
+        Claim.above("fortune smiles", "Fig. 4", 0.0, "kf-alone/luck_1"),
+        Claim("errors have a size", "Fig. 5", ("kf-alone/error_m",), lambda e: [1.0 + e**2], "squares are positive"),
         Claim.order("nobody measured it", "Fig. 3", "kf-alone/error_m", "kf-nobody/error_m"),
     ), piece=20)
 """
@@ -85,7 +95,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def reproduced(*words: str) -> Any:
     result = run("reproduce", *words, "--json")
     assert result.exit_code == 0, result.stderr
-    assert result.stderr == ""
+    assert all(TOLD.match(line) for line in result.stderr.splitlines())
     return strict_json(result.stdout)
 
 
@@ -99,7 +109,7 @@ def test_the_linear_scenario_as_json() -> None:
             assert figures[f"kf-{row}/{quantity}"]["published"] > 0
     for name, figure in figures.items():
         assert NAME.match(name), name
-        assert list(figure) == ["name", "value", "standard_error", "published", "verdict"]
+        assert list(figure) == ["name", "value", "standard_error", "published", "verdict", "reason"]
         assert figure["verdict"] in VERDICTS
         if "armse" in name:  # what a filter claims may be the same in every run
             assert 0 < figure["standard_error"] < 0.2 * figure["value"]
@@ -119,7 +129,10 @@ def test_a_seed_decides_the_figures() -> None:
 def test_of_one_run_the_error_is_not_known() -> None:
     answer = reproduced("li2022-linear", "--only", "kf-a", "--runs", "1")
     assert {f["standard_error"] for f in answer["figures"]} == {None}
-    assert {f["verdict"] for f in answer["figures"]} == {"not given"}
+    given = {f["verdict"] for f in answer["figures"] if f["published"] is not None}
+    assert given == {"undecided"}
+    assert {f["verdict"] for f in answer["figures"] if f["published"] is None} == {"not given"}
+    assert {c["verdict"] for c in answer["claims"]} == {"undecided"}
 
 
 @pytest.mark.slow
@@ -127,6 +140,23 @@ def test_without_runs_the_scenario_decides(files: Coin) -> None:
     assert reproduced(files.coin)["runs"] == 30
     assert files.asked() == {"coin.asked-0-0-20", "coin.asked-0-20-30"}
     assert reproduced(files.coin, "--publication")["runs"] == 900
+
+
+def test_more_runs_are_added_until_all_is_decided(files: Coin, tmp_path: Path) -> None:
+    """Fortune smiles by .3 standard deviations: 30 runs cannot tell, 120 and 240 can; what is done is kept."""
+    text = (tmp_path / "coin.py").read_text().replace('float("nan")', "0.0")
+    (tmp_path / "coin.py").write_text(text)
+    answer = reproduced(files.coin, "--until-decided", "600")
+    verdicts = {c["claim"]: c["verdict"] for c in answer["claims"]}
+    assert verdicts["fortune smiles"] == "agrees"
+    assert answer["runs"] in (60, 120, 240)
+    asked = sorted(name.partition("-0-")[2] for name in files.asked())
+    assert len(asked) == answer["runs"] // 20 + 1  # each piece of 20 once, and the last of 30 runs, which was half one
+
+
+def test_the_limit_ends_it(files: Coin) -> None:
+    assert reproduced(files.coin, "--until-decided", "50")["runs"] == 50  # a figure's error stays unknown
+    assert reproduced(files.coin, "--until-decided", "20")["runs"] == 30
 
 
 def test_several_names_give_a_list_each_once(files: Coin) -> None:
@@ -154,12 +184,28 @@ def test_what_is_written(files: Coin) -> None:
     assert {f["name"]: f["value"] for f in coin["figures"]}["kf-sum/heads_1"] == sum(range(30))
     assert coin["claims"] == [
         {
-            "claim": "heads & tails are rare", "source": "Fig. 1", "verdict": "does not reproduce",
+            "claim": "heads & tails are rare", "source": "Fig. 1", "verdict": "contradicts", "reason": "",
             "evidence": {"kf-sum/heads_1": 435.0},
         },
         {
-            "claim": "naive lies between", "source": "Fig. 2", "verdict": "agrees",
-            "evidence": {"kf-alone/error_m": 1.0, "kf-naive/error_m": 2.0, "kf-ic/error_m": 9.0},
+            "claim": "all is better than one", "source": "Fig. 2", "verdict": "agrees", "reason": "",
+            "evidence": {"kf-alone/error_m": pytest.approx(1.0), "kf-ic/error_m": pytest.approx(9.0)},
+        },
+        {
+            "claim": "naive lies between", "source": "Fig. 2", "verdict": "undecided",
+            "reason": "its error is not known",
+            "evidence": {
+                "kf-alone/error_m": pytest.approx(1.0), "kf-naive/error_m": 2.0,
+                "kf-ic/error_m": pytest.approx(9.0),
+            },
+        },
+        {
+            "claim": "fortune smiles", "source": "Fig. 4", "verdict": "undecided",
+            "reason": "too close to tell from these runs", "evidence": {"kf-alone/luck_1": pytest.approx(0.3)},
+        },
+        {
+            "claim": "errors have a size", "source": "Fig. 5", "verdict": "by construction",
+            "reason": "squares are positive", "evidence": {"kf-alone/error_m": pytest.approx(1.0)},
         },
     ]  # fmt: skip
     assert coin["charts"][0]["series"][0]["y"] == [1.0, None, 2.0]
@@ -202,7 +248,8 @@ def test_the_page_is_whole_and_asks_for_nothing_from_outside(files: Coin) -> Non
         "A fair <coin>",
         "1.000 ± 0.010",
         "1.01",
-        "does not reproduce",
+        "contradicts",
+        "by construction: squares are positive",
         "heads & tails are rare",
         "it is fair",
     ):
@@ -219,9 +266,10 @@ def test_the_table_shows_error_published_and_verdict(files: Coin) -> None:
     assert "error / m, ± standard error" in result.stdout
     rows = [re.split(r" {2,}", line.rstrip()) for line in result.stdout.splitlines()]
     assert ["kf-alone", "1.000 ± 0.010", "1.01", "agrees"] in rows
-    assert ["kf-ic", "9.000 ± 0.010", "0.5", "does not reproduce"] in rows
+    assert ["kf-ic", "9.000 ± 0.010", "0.5", "contradicts"] in rows
     assert ["kf-naive", "2", "not given"] in rows
-    assert ["naive lies between (error / m: kf-alone 1, kf-naive 2, kf-ic 9)", "agrees"] in rows
+    assert ["all is better than one (error / m: kf-alone 1, kf-ic 9)", "agrees"] in rows
+    assert ["fortune smiles (luck: kf-alone 0.3)", "undecided: too close to tell from these runs"] in rows
     assert "30, seed 0" in result.stdout
     assert re.search(r"Assumed +it is fair", result.stdout)
 

@@ -34,7 +34,7 @@ class Plain:
 
 def predict(mean: Floats, cov: Floats, f: Floats, q: Floats) -> tuple[Floats, Floats]:
     """Predict by the Kalman filter; F and Q may be one for each state."""
-    return Plain(Kalman()).predict(mean, cov, Transition(np.asarray, np.asarray, q, q, f))
+    return Plain(Kalman()).predict(mean, cov, Transition.additive(np.asarray, np.asarray, q, q, f))
 
 
 def update(mean: Floats, cov: Floats, z: Floats, h: Floats, r: Floats) -> tuple[Floats, Floats, Any]:

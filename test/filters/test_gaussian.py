@@ -102,7 +102,7 @@ def test_means_of_cubic_functions_are_exact(name):
         return x @ a.T + np.einsum("ijk,...j,...k", b, x, x) + np.einsum("ijkl,...j,...k,...l", c, x, x, x)
 
     points, weight = quadrature(mean, cov, 6)
-    transition = Transition(cubic, lambda x: x, np.eye(3), np.eye(3))
+    transition = Transition.additive(cubic, lambda x: x, np.eye(3), np.eye(3))
     found, _ = SIGMA[name].predict(mean, cov, transition)
     np.testing.assert_allclose(found, weight @ cubic(points), rtol=1e-10)
 
@@ -110,7 +110,7 @@ def test_means_of_cubic_functions_are_exact(name):
 def test_unscented_with_three_minus_n_gets_the_variance_of_a_square():
     """In one axis kappa = 2 makes the points those of Gauss-Hermite of order 3: x^2 has variance 4 m^2 P + 2 P^2."""
     mean, cov = np.array([1.5]), np.array([[0.7]])
-    square = Transition(lambda x: x**2, lambda x: 2 * x[..., None], np.array([[0.3]]), np.array([[1.0]]))
+    square = Transition.additive(lambda x: x**2, lambda x: 2 * x[..., None], np.array([[0.3]]), np.array([[1.0]]))
     _, found = Plain(Unscented(UnscentedParams(kappa=2.0))).predict(mean, cov, square)
     assert found[0, 0] == pytest.approx(4 * 1.5**2 * 0.7 + 2 * 0.7**2 + 0.3, rel=1e-12)
     _, too_small = FILTERS["cubature"].predict(mean, cov, square)
@@ -273,7 +273,7 @@ def test_filters_are_consistent_where_bearings_curve_little(name):
     truth = start + rng.normal(size=(runs, N)) * np.sqrt(np.diag(cov0))
     seen = []
     for _ in range(10):
-        truth = transition.advance(truth) + rng.normal(size=(runs, N)) @ transition.noise_factor.T
+        truth = transition.advance(truth) + rng.normal(size=(runs, N)) @ transition.noise_factor(truth).T
         seen.append(sensor.observe(truth) + rng.normal(size=(runs, 2)) * np.sqrt(np.diag(sensor.noise)))
 
     def mean_nees(assumed):

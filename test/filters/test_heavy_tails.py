@@ -70,7 +70,7 @@ def test_infinite_dof_is_the_kalman_filter(dof):
     mean, cov, z = rng.normal(size=(5, N)), random_cov(rng, 5, N), rng.normal(size=(5, 2))
     sensor = LinearSensor(("a", "b"), rng.normal(size=(2, N)), random_cov(rng, 2))
     transition = Transition.linear(rng.normal(size=(N, N)), random_cov(rng, N))
-    wanted = kalman.predict(mean, cov, transition.jacobian(mean), transition.noise)
+    wanted = kalman.predict(mean, cov, transition.jacobian(mean), transition.noise(mean))
     wanted = kalman.update(*wanted, z, sensor.matrix, sensor.noise)
     found = student_update(*Plain(StudentT()).predict(mean, cov, transition), dof, z, sensor)
     np.testing.assert_allclose(found[0], wanted[0], rtol=1e-9)
@@ -183,8 +183,9 @@ def test_robust_filters_beat_kalman_where_one_noise_in_ten_is_an_outlier(intensi
     f, g = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.5], [1.0]])
     sensor = LinearSensor(("x",), np.array([[1.0, 0.0]]), np.array([[16.0]]))
     heavy = LinearSensor(("x",), sensor.matrix, 3.0 * sensor.noise)  # nominal values are scatters of t(3)
-    nominal = Transition.linear(f, intensity * g @ g.T + 1e-6 * np.eye(2))
-    wide = Transition.linear(f, 3.0 * nominal.noise)
+    noise = intensity * g @ g.T + 1e-6 * np.eye(2)
+    nominal = Transition.linear(f, noise)
+    wide = Transition.linear(f, 3.0 * noise)
     cov = np.tile(np.diag([10.0, 25.0]), (runs, 1, 1))
     truth = np.array([0.0, 5.0]) + rng.normal(size=(runs, 2)) * np.sqrt([10.0, 25.0])
     states = {name: (np.tile([0.0, 5.0], (runs, 1)), cov) for name in ("kalman", "student", "mixture")}
@@ -193,7 +194,7 @@ def test_robust_filters_beat_kalman_where_one_noise_in_ten_is_an_outlier(intensi
     for _ in range(steps):
         truth = truth @ f.T + contaminated(rng, (runs, 1), np.sqrt(intensity), share) @ g.T
         z = truth[:, :1] + contaminated(rng, (runs, 1), 4.0, 0.1)
-        mean, cov = kalman.predict(*states["kalman"], f, nominal.noise)
+        mean, cov = kalman.predict(*states["kalman"], f, noise)
         states["kalman"] = kalman.update(mean, cov, z, sensor.matrix, sensor.noise)[:2]
         states["student"] = student_update(*student.predict(*states["student"], wide), 3.0, z, heavy)[:2]
         states["mixture"] = mixture_update(*mixture.predict(*states["mixture"], nominal), z, sensor)[:2]

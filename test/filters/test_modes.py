@@ -165,7 +165,7 @@ def test_range_and_its_rate_against_a_million_samples():
     for z in zs:
         for m, transition in enumerate(TRANSITIONS):
             at = mode == m
-            x[at] = transition.advance(x[at]) + rng.normal(size=(at.sum(), 4)) @ transition.noise_factor.T
+            x[at] = transition.advance(x[at]) + rng.normal(size=(at.sum(), 4)) @ transition.noise_factor(x[at]).T
         mode = (rng.random(count)[:, None] > np.cumsum(CHAIN[mode], 1)).sum(1)
         log -= 0.5 * ((z - sensor.observe(x)) ** 2 / np.diag(sensor.noise)).sum(1)
     weight = np.exp(log - log.max())
@@ -190,7 +190,7 @@ def test_modes_are_recognised():
     straight, alone = truth, np.tile(COV, (runs, 1, 1))
     errors = [[], []]
     for _ in range(30):
-        truth = TRANSITIONS[1].advance(truth) + rng.normal(size=(runs, 4)) @ TRANSITIONS[1].noise_factor.T
+        truth = TRANSITIONS[1].advance(truth) + rng.normal(size=(runs, 4)) @ TRANSITIONS[1].noise_factor(truth).T
         z = truth[:, :2] + 2.0 * rng.normal(size=(runs, 2))
         modes, _ = IMM.update(IMM.predict(modes, TRANSITIONS), z, SENSOR)
         straight, alone = kalman.predict(straight, alone, *MOTIONS[0].matrices(1.0))

@@ -8,6 +8,7 @@ import pytest
 import scipy.stats
 
 from track_fusion.metrics.evaluation import MIN_SAMPLES, Evaluation, EvaluationParams
+from track_fusion.metrics.pairing import paired
 from track_fusion.tracks import CONFIRMED, StateLayout, TrackBatch, planar_layout
 
 LAYOUT = planar_layout()
@@ -160,6 +161,13 @@ def test_turn_rates_are_judged_in_degrees_a_second():
     assert figures["turn_rate_armse_degps"] == pytest.approx(np.degrees(0.02))
     assert figures["turn_rate_rmse_degps"] == pytest.approx(np.degrees(np.sqrt((0.03**2 + 0.01**2) / 2)))
     assert "turn_rate_armse_degps" not in evaluation().result()["all"]
+
+
+def test_a_box_whose_front_is_unknown_is_judged_by_its_own_period():
+    layout = StateLayout(("x", "y", "yaw"), (np.inf, np.inf, np.pi))
+    truth, mean = np.array([[0.0, 0.0, 1.5]]), np.array([[0.0, 0.0, -1.6]])
+    pairs = paired(layout, truth, mean, np.eye(3)[None], 1.0)
+    np.testing.assert_allclose(pairs.error, [[0.0, 0.0, np.pi - 3.1]], atol=1e-12)
 
 
 SECOND = 1_000_000_000

@@ -1,5 +1,7 @@
 """Motion and sensor models: laws they obey."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,9 +9,12 @@ from hypothesis import strategies as st
 
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
+from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams, KnownTurn, KnownTurnParams
+from track_fusion.params import ParameterError
 from track_fusion.tracks import StateLayout, planar_layout
 
-LAYOUTS = [("x", "vx"), ("x", "y", "vx", "vy"), ("vz", "x", "z", "vx", "y", "vy")]
+BOX = ("yaw", "x", "y", "length", "vx", "vy", "width", "height")
+LAYOUTS = [("x", "vx"), ("x", "y", "vx", "vy"), ("vz", "x", "z", "vx", "y", "vy"), BOX]
 FORMS = ["continuous", "piecewise_constant"]
 durations = st.floats(0.0, 100.0)
 
@@ -41,7 +46,7 @@ def test_position_moves_by_velocity_times_time(axes):
     state = np.arange(1.0, len(axes) + 1)
     moved = motion.matrices(2.5)[0] @ state
     for i, axis in enumerate(axes):
-        speed = 0.0 if axis.startswith("v") else state[layout.axes.index("v" + axis)]
+        speed = state[layout.axes.index("v" + axis)] if "v" + axis in axes else 0.0
         assert moved[i] == pytest.approx(state[i] + 2.5 * speed)
 
 
@@ -70,7 +75,8 @@ def test_noise_factor_squares_to_the_noise(axes, form, dt):
     motion = model(axes, form)
     factor = motion.noise_factor(dt)
     np.testing.assert_allclose(factor @ factor.T, motion.matrices(dt)[1], rtol=1e-12, atol=1e-300)
-    draws = len(axes) // 2 if form == "piecewise_constant" else len(axes)
+    pairs = sum(axis.startswith("v") for axis in axes)
+    draws = len(axes) - pairs if form == "piecewise_constant" else len(axes)
     assert factor.shape == (len(axes), draws)
 
 
@@ -88,10 +94,75 @@ def test_prediction_does_not_go_backward():
         model().matrices(-0.1)
 
 
-@pytest.mark.parametrize("axes", [("x", "y"), ("x", "vx", "yaw"), ("x", "vx", "y"), ("vx", "vy"), ("x", "vy")])
+@pytest.mark.parametrize("axes", [("x", "y"), ("x", "vx", "ax"), ("x", "vx", "y"), ("vx", "vy"), ("x", "vy")])
 def test_layouts_that_are_not_pairs_are_refused(axes):
     with pytest.raises(ValueError, match="needs axes like x, vx in pairs. Got " + ", ".join(axes)):
         NearlyConstantVelocity(StateLayout(axes), MotionParams())
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_axes_without_a_motion_follow_a_random_walk(form):
+    """Each gains its own variance in proportion to time, alone; beside them position and velocity move as ever."""
+    noise = dict(zip(("yaw", "length", "width", "height"), (0.3, 0.1, 0.0, 0.2), strict=True))
+    params = MotionParams(noise_form=form, process_noise=3.0, random_walk_noise=tuple(noise.values()))
+    transition, q = NearlyConstantVelocity(StateLayout(BOX), params).matrices(2.5)
+    plane = [BOX.index(axis) for axis in LAYOUTS[1]]
+    for whole, alone in zip((transition, q), model(form=form).matrices(2.5), strict=True):
+        np.testing.assert_array_equal(whole[np.ix_(plane, plane)], alone)
+    for axis, sd in noise.items():
+        row = np.zeros(len(BOX))
+        row[BOX.index(axis)] = 1.0
+        np.testing.assert_array_equal(transition[BOX.index(axis)], row)
+        np.testing.assert_allclose(q[BOX.index(axis)], 2.5 * sd**2 * row, rtol=1e-15)
+    one = dataclasses.replace(params, random_walk_noise=(0.3,))
+    variance = np.diag(NearlyConstantVelocity(StateLayout(BOX), one).matrices(2.5)[1])
+    np.testing.assert_allclose([variance[BOX.index(axis)] for axis in noise], 2.5 * 0.09, rtol=1e-15)
+
+
+TURNING = {
+    "coordinated": (CoordinatedTurn, CoordinatedTurnParams, ("vy", "length", "turn_rate", "x", "y", "vx")),
+    "known": (KnownTurn, KnownTurnParams, ("vy", "length", "x", "y", "vx")),
+}
+
+
+@pytest.mark.parametrize("name", TURNING)
+def test_a_turning_target_carries_axes_without_a_motion(name):
+    motion, params, axes = TURNING[name]
+    rest = [i for i, axis in enumerate(axes) if axis != "length"]
+    whole = motion(StateLayout(axes), params(random_walk_noise=(0.3,))).over(2.0)
+    alone = motion(StateLayout(tuple(axes[i] for i in rest)), params()).over(2.0)
+    state = np.linspace(1.0, 2.0, len(axes))
+    np.testing.assert_allclose(whole.advance(state)[rest], alone.advance(state[rest]), rtol=1e-14)
+    assert whole.advance(state)[1] == pytest.approx(state[1], rel=1e-15)
+    parts = (whole.jacobian(state), alone.jacobian(state[rest]), 1.0), (whole.noise(state), alone.noise(state), 0.18)
+    for matrix, part, own in parts:
+        np.testing.assert_allclose(matrix[np.ix_(rest, rest)], part, rtol=1e-13, atol=1e-13)
+        np.testing.assert_allclose(matrix[1], own * np.eye(len(axes))[1], atol=1e-14)
+        np.testing.assert_allclose(matrix[:, 1], own * np.eye(len(axes))[1], atol=1e-14)
+    factor = whole.noise_factor(state)
+    np.testing.assert_allclose(factor @ factor.T, whole.noise(state), rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("axes", "count", "text"),
+    [
+        (("x", "vx", "yaw", "width"), 3, "one number, or one for each of yaw, width. Got 3."),
+        (("x", "vx", "yaw"), 0, "one number, or one for each of yaw. Got 0."),
+        (("x", "vx"), 2, "one number: every axis has a motion of its own. Got 2."),
+    ],
+)
+def test_another_number_of_random_walks_is_refused(axes, count, text):
+    with pytest.raises(ParameterError) as caught:
+        NearlyConstantVelocity(StateLayout(axes), MotionParams(random_walk_noise=(0.1,) * count))
+    assert str(caught.value) == f"The 'random_walk_noise' parameter must hold {text}"
+
+
+@pytest.mark.parametrize("name", TURNING)
+@pytest.mark.parametrize("extra", ["z", "vz", "ax"])
+def test_a_turn_does_not_take_half_a_motion_beside_it(name, extra):
+    motion, params, axes = TURNING[name]
+    with pytest.raises(ValueError, match=f"needs axes x, y, vx, vy.*Got .*, {extra}"):
+        motion(StateLayout((*axes, extra)), params())
 
 
 def test_position_sensor_reads_the_position_axes_wherever_they_stand():

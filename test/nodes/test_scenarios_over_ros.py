@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from ros_helpers import Probe
 from sensor_msgs.msg import PointCloud2
 
-from msg_adapters.arrays import merged
 from track_fusion.demo.bringup import local_environment, running, start_scenario
 from track_fusion.demo.wiring import Bringup, bringups
 from track_fusion.rules import RULES, get_rule
@@ -29,6 +28,7 @@ from track_fusion.scenarios.li2022 import linear as li2022_linear
 from track_fusion.scenarios.li2022 import nonlinear as li2022_nonlinear
 from track_fusion.scenarios.sharma import radar_runs as sharma_radar_runs
 from track_fusion.study.one_target import Row, alone_row, drawn, fused_row, sir_filters
+from track_fusion.tracks import TrackBatch
 
 SEED, RUN = 5, 2
 RUN_S = 300.0  # a run takes 5 s on two idle cores; tests of others may be running
@@ -139,11 +139,11 @@ def test_the_nodes_give_the_numbers_of_the_library(
     scenario = get_scenario(Bringup(case.name).scenario)
     tracking = scenario.tracking
     assert tracking is not None
-    step_ns, axes = round(tracking.dt_s * 1e9), tracking.motion.layout.axes
+    step_ns, layout = round(tracking.dt_s * 1e9), tracking.layout
     assert [stamp_ns(m) for m in messages] == [k * step_ns for k in range(1, tracking.steps + 1)]
     draws = drawn(tracking, [RUN], SEED)
     expected = np.array([fused.mean[0] for fused in case.library.estimates(draws)])
-    estimated = np.array([merged(read(m), axes)[0][0] for m in messages])
+    estimated = np.array([TrackBatch(layout=layout, **read(m).columns).moments[0][0] for m in messages])
     scale = np.abs(expected).max(0)
     np.testing.assert_allclose(estimated / scale, expected / scale, rtol=0, atol=TOLERANCE)
     assert (judged["times"], judged["missed"], judged["false"]) == (tracking.steps, 0, 0)

@@ -126,6 +126,7 @@ BROKEN: dict[str, tuple[str, Rule]] = {
     "claims that the order matters": ("order_of_sources", _claiming(order_matters=True)),
     "adds a metre": ("affine_equivariance", _giving(mean=lambda t, f: f.mean + 1.0)),
     "claims to depend on units": ("affine_equivariance", _claiming(affine_equivariant=False)),
+    "looks at the origin": ("axes_that_wrap", _giving(mean=lambda t, f: 1.01 * f.mean)),
     "claims too little": ("guarantee", _giving(cov=lambda t, f: 0.9 * f.cov)),
     "claims far too much": ("guarantee", _giving(cov=lambda t, f: 2.0 * f.cov)),
     "promises for a mean that bends": ("guarantee", _giving(mean=lambda t, f: f.mean**3)),
@@ -251,6 +252,10 @@ def test_malformed_tracks(rule: Rule) -> None:
     assert fail(cov=cov) == "The 'cov' of source tracks must be symmetric."
     assert fail(dof=np.full((3, 2), 2.0)) == "The 'dof' of source tracks must exceed 2. Got 2.0."
     assert fail(dof=np.full(3, 5.0)) == "The 'dof' of source tracks must have shape (3, 2). Got (3,)."
+    assert fail(periods=(6.0, -1.0, np.inf, np.inf)) == (
+        "The 'periods' of source tracks must be 4 numbers > 0, infinite where an axis does not wrap. "
+        "Got (6.0, -1.0, inf, inf)."
+    )
     for name in rule.needs:
         assert fail(extras={}) == f"The rule '{rule.key}' needs '{name}' beside the tracks. Got none."
         break

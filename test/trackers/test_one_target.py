@@ -302,7 +302,7 @@ def gaussian(rng, mean, cov):
 def moved(rng, points):
     """Points a second later."""
     transition = MOTION.over(1.0)
-    return transition.advance(points) + rng.normal(size=(50, 4)) @ transition.noise_factor.T
+    return transition.advance(points) + rng.normal(size=(50, 4)) @ transition.noise_factor(points).T
 
 
 def test_particles_are_drawn_in_the_order_of_the_library():

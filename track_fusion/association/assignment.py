@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
@@ -82,10 +84,16 @@ def _sparse(row: Indices, col: Indices, cost: Array, miss: float, rows: int, col
 
 
 def nearest_neighbour(
-    row_mean: Array, row_cov: Array, col_mean: Array, col_cov: Array, gamma: float, position: tuple[int, ...]
+    row_mean: Array,
+    row_cov: Array,
+    col_mean: Array,
+    col_cov: Array,
+    gamma: float,
+    position: tuple[int, ...],
+    periods: Sequence[float] = (),
 ) -> Indices:
     """Gate and assign in one call; arguments as for `gate`, the result as for `assign`."""
-    candidates = gate(row_mean, row_cov, col_mean, col_cov, gamma, position)
+    candidates = gate(row_mean, row_cov, col_mean, col_cov, gamma, position, periods)
     return assign(candidates, len(row_mean), len(col_mean), gamma)
 
 

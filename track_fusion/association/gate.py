@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from track_fusion.angles import difference
 from track_fusion.linalg import Array
 
 Indices = NDArray[np.intp]
@@ -36,16 +37,23 @@ class Candidates:
 
 
 def gate(
-    row_mean: Array, row_cov: Array, col_mean: Array, col_cov: Array, gamma: float, position: tuple[int, ...]
+    row_mean: Array,
+    row_cov: Array,
+    col_mean: Array,
+    col_cov: Array,
+    gamma: float,
+    position: tuple[int, ...],
+    periods: Sequence[float] = (),
 ) -> Candidates:
-    """Find all pairs with (x_i - x_j)' (P_i + P_j)^-1 (x_i - x_j) <= gamma.
+    """Find all pairs with (x_i - x_j)' (P_i + P_j)^-1 (x_i - x_j) <= gamma, differences the short way round.
 
     Parameters
     ----------
     row_mean, row_cov : (M, n), (M, n, n)
     col_mean, col_cov : (N, n), (N, n, n)
     gamma : float                 quantile of chi-square with n degrees of freedom
-    position : tuple of int       axes that a spatial search may use; empty: try all pairs
+    position : tuple of int       axes that a spatial search may use, none that wraps; empty: try all pairs
+    periods : (n,)                of axes that wrap, infinite for the others; empty: none wraps
 
     Returns
     -------
@@ -54,9 +62,9 @@ def gate(
     if len(row_mean) * len(col_mean) <= TRY_ALL or not position:
         row, col = np.divmod(np.arange(len(row_mean) * len(col_mean)), max(len(col_mean), 1))
         pieces = [(row[i : i + PIECE], col[i : i + PIECE]) for i in range(0, max(len(row), 1), PIECE)]
-        return _joined([_exact(row_mean, row_cov, col_mean, col_cov, *piece, gamma) for piece in pieces])
+        return _joined([_exact(row_mean, row_cov, col_mean, col_cov, *piece, gamma, periods) for piece in pieces])
     near = _near(row_mean, row_cov, col_mean, col_cov, gamma, list(position))
-    pairs = _joined([_exact(row_mean, row_cov, col_mean, col_cov, *piece, gamma) for piece in near])
+    pairs = _joined([_exact(row_mean, row_cov, col_mean, col_cov, *piece, gamma, periods) for piece in near])
     order = np.lexsort((pairs.col, pairs.row))
     return Candidates(pairs.row[order], pairs.col[order], pairs.distance[order], pairs.logdet[order])
 
@@ -68,9 +76,16 @@ def _joined(parts: list[Candidates]) -> Candidates:
 
 
 def _exact(
-    row_mean: Array, row_cov: Array, col_mean: Array, col_cov: Array, row: Indices, col: Indices, gamma: float
+    row_mean: Array,
+    row_cov: Array,
+    col_mean: Array,
+    col_cov: Array,
+    row: Indices,
+    col: Indices,
+    gamma: float,
+    periods: Sequence[float],
 ) -> Candidates:
-    residual = row_mean[row] - col_mean[col]
+    residual = difference(row_mean[row], col_mean[col], periods)
     lower = np.linalg.cholesky(row_cov[row] + col_cov[col])
     white = np.linalg.solve(lower, residual[..., None])[..., 0]
     distance = (white * white).sum(-1)

@@ -44,8 +44,8 @@ def associate(config: CentreConfig, pool: Pool, fresh: Bools) -> Association:
 def _nearest(config: CentreConfig, pool: Pool, fresh: Bools) -> tuple[Rows, int]:
     """Give the target of each source track, (P,), -1 = none, and count the newborn."""
     mean, cov, central_mean, central_cov = pool.split()
-    count, gamma, position = len(central_mean), config.gamma, config.layout.position
-    near = gate(mean, cov, central_mean, central_cov, gamma, position)
+    count, gamma, axes = len(central_mean), config.gamma, (config.layout.position, config.layout.periods)
+    near = gate(mean, cov, central_mean, central_cov, gamma, *axes)
     # One to one within each source, all sources at once: to each its own copy of the central tracks.
     own = dataclasses.replace(near, col=near.col + count * pool.source[near.row])
     target = assign(own, len(mean), count * len(config.sources), gamma)
@@ -54,7 +54,7 @@ def _nearest(config: CentreConfig, pool: Pool, fresh: Bools) -> tuple[Rows, int]
     leftover = np.flatnonzero((target < 0) & fresh[pool.source])
     for k in np.unique(pool.source[leftover]):
         left = leftover[pool.source[leftover] == k]
-        joined = nearest_neighbour(mean[left], cov[left], mean[starters], cov[starters], gamma, position)
+        joined = nearest_neighbour(mean[left], cov[left], mean[starters], cov[starters], gamma, *axes)
         starts = joined < 0
         joined[starts] = len(starters) + np.arange(starts.sum())
         target[left] = count + joined

@@ -28,12 +28,14 @@ class Fused(NamedTuple):
     has : (M, n)           which axes each has: those that some member has
     unconverged : int      fusions whose weights did not converge
     unsound : int          fusions whose result was no density, so that a single member was taken instead
+    beyond : int           fusions of members beyond a half circle, which have no mean direction
     """
 
     tracks: TrackBatch
     has: Bools
     unconverged: int = 0
     unsound: int = 0
+    beyond: int = 0
 
 
 def fuse(
@@ -81,8 +83,8 @@ def _in_order(rows: Sequence[Rows], parts: Sequence[Fused]) -> Fused:
     if len(parts) == 1:
         return parts[0]
     order = np.argsort(np.concatenate(rows), kind="stable")
-    tracks, has, unconverged, unsound = zip(*parts, strict=True)
-    return Fused(TrackBatch.concatenate(tracks)[order], np.concatenate(has)[order], sum(unconverged), sum(unsound))
+    tracks, has, *counts = zip(*parts, strict=True)
+    return Fused(TrackBatch.concatenate(tracks)[order], np.concatenate(has)[order], *map(sum, counts))
 
 
 def _weighed(config: CentreConfig, pool: Pool, at: Rows) -> Iterator[tuple[Rows | slice, Params]]:
@@ -113,7 +115,7 @@ def _applied(config: CentreConfig, pool: Pool, at: Rows, params: Params, extras:
     if at.shape[1] == 1:
         return first
     try:
-        fused = config.rule.fuse(pool.gather(at, extras, config.rule.takes_particles), params)
+        fused = config.rule.apply(pool.gather(at, extras, config.rule.takes_particles), params)
     except np.linalg.LinAlgError:
         if len(at) == 1:
             return _first(pool, at[:, -1:])._replace(unsound=1)
@@ -122,7 +124,9 @@ def _applied(config: CentreConfig, pool: Pool, at: Rows, params: Params, extras:
     weight, mean, cov = _components(fused)
     dof = np.full(len(at), np.inf) if fused.dof is None else fused.dof
     unconverged = int(np.count_nonzero(~np.asarray(fused.info.get("converged", True))))
-    result = Fused(first.tracks.replace(weight=weight, mean=mean, cov=cov, dof=dof), first.has, unconverged)
+    beyond = int(np.count_nonzero(fused.info.get("beyond_half_circle", False)))
+    tracks = first.tracks.replace(weight=weight, mean=mean, cov=cov, dof=dof)
+    result = Fused(tracks, first.has, unconverged, beyond=beyond)
     sound = result.tracks.sound
     if sound.all():
         return result

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from track_fusion.angles import wrap
 from track_fusion.centre.config import CentreConfig
 from track_fusion.centre.state import Bools, CentralTracks
 from track_fusion.filters.base import Gaussian
@@ -27,7 +28,7 @@ Rows = NDArray[np.intp]
 def admitted(
     config: CentreConfig, newest: Sequence[TrackBatch | None], time_ns: int, scans: Mapping[int, TrackBatch]
 ) -> tuple[TrackBatch | None, ...]:
-    """Take new scans into the newest of each source, (S,), brought into the centre's axes and frame.
+    """Take new scans into the newest of each source, (S,), brought into the centre's axes and frame, angles wrapped.
 
     Left out are source tracks that the parameters exclude, and identities: a central track's is its own.
 
@@ -42,7 +43,7 @@ def admitted(
         scan = scan if keep.all() else scan[keep]
         transform = config.sources[source].transform
         brought = scan if transform is None else transform(scan, config.layout, config.frame_id)
-        held[source] = brought.replace(uuid=None).owned()
+        held[source] = brought.replace(uuid=None, mean=wrap(brought.mean, config.layout.periods)).owned()
     return tuple(held)
 
 
@@ -136,7 +137,8 @@ class Pool:
             bare = _bare(self.tracks)[at]
             merge = bare & ~bare.all(1, keepdims=True) if take_particles else self.particles[at]
             mixture = self._mixtures(at, merge)
-        return SourceTracks(self.mean[at], self.cov[at], None if np.isinf(dof).all() else dof, mixture, extras)
+        dof_or_none = None if np.isinf(dof).all() else dof
+        return SourceTracks(self.mean[at], self.cov[at], dof_or_none, mixture, extras, self.tracks.layout.periods)
 
     def _mixtures(self, at: Rows, merge: Bools) -> Mixture:
         """Mixtures of members (M, K); those of `merge`, (M, K), by their Gaussians."""
@@ -183,4 +185,4 @@ def predicted_to(batch: TrackBatch, time_ns: int, motion: Motion) -> TrackBatch:
         at = batch.time_ns == stamp
         transition = motion.over((time_ns - int(stamp)) / SECOND_NS)
         mean[at], cov[at] = Extended().predict(Gaussian(batch.mean[at], batch.cov[at]), transition).moments
-    return batch.replace(mean=mean, cov=cov, time_ns=np.full(len(batch), time_ns))
+    return batch.replace(mean=wrap(mean, batch.layout.periods), cov=cov, time_ns=np.full(len(batch), time_ns))

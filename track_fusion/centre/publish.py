@@ -27,6 +27,7 @@ class StepInfo:
                                 with memory each central track that was fused with new ones
     unconverged : int           fusions whose weights did not converge
     unsound : int               fusions whose result was no density, so that a single member was taken instead
+    beyond_half_circle : int    fusions of members that have no mean direction, made about the most certain one
     """
 
     members: NDArray[np.intp]
@@ -34,6 +35,7 @@ class StepInfo:
     shared_provenance: int
     unconverged: int
     unsound: int
+    beyond_half_circle: int
 
 
 def publish(params: FusionCentreParams, tracks: TrackBatch) -> TrackBatch:
@@ -46,4 +48,5 @@ def told(sources: int, pool: Pool, association: Association, fused: Fused, chang
     member = association.member
     foreign = int(np.count_nonzero(pool.tracks.source[member] & ~pool.bit[member]))
     taken = np.bincount(pool.source[member], minlength=sources)
-    return StepInfo(taken, changes, foreign + len(association.remembered), fused.unconverged, fused.unsound)
+    shared = foreign + len(association.remembered)
+    return StepInfo(taken, changes, shared, fused.unconverged, fused.unsound, fused.beyond)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -14,9 +14,15 @@ from track_fusion.cli import output
 from track_fusion.params import ParameterError
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from track_fusion.metrics.significance import Difference
     from track_fusion.scenarios import Outcomes, Scenario
+    from track_fusion.study.comparison import Group, Score
     from track_fusion.study.study import RuleSpec
+
+#: What the numbers of a group are, where smaller is not better.
+NOTES = {"error": "", "claimed": " (what is claimed, neither good nor bad)", "consistency": " (1 is right)"}
 
 
 @click.command(short_help="Compare fusion rules on a published scenario.")
@@ -34,8 +40,11 @@ if TYPE_CHECKING:
 def compare(name: str, rules: str, params: str, runs: int | None, seed: int, jobs: int | None, as_json: bool) -> None:
     """Run fusion rules on a scenario, all under the same noise, and tell which is better by how much.
 
-    Every quantity is one number a run, smaller is better. Differences are paired run by run; p is the two-sided
-    p-value of the paired t-test, adjusted for the number of pairs by Holm's method.
+    Every quantity is one number a run; of errors smaller is better, of consistency (squared error over its claim) 1 is
+    right, and what a rule claims is neither good nor bad. Differences of errors are paired run by run; p is the
+    two-sided p-value of the paired t-test, adjusted by Holm's method for all pairs of all quantities. Where nothing is
+    random there is no p. A run has diverged whose error is not finite or ten times the median of the best rule; a rule
+    that diverges is never significantly better.
 
     \b
     Examples:
@@ -43,8 +52,8 @@ def compare(name: str, rules: str, params: str, runs: int | None, seed: int, job
       track-fusion compare li2022-linear --rules ./my_rule.py,covariance_intersection@uniform --runs 1000
     """  # noqa: D301  click reads \b as "do not wrap"
     from track_fusion.cli.progress import results
-    from track_fusion.metrics.significance import paired_differences
     from track_fusion.scenarios import find_scenario
+    from track_fusion.study.comparison import grouped
     from track_fusion.study.study import Study, choice
 
     scenario = find_scenario(name)
@@ -56,12 +65,12 @@ def compare(name: str, rules: str, params: str, runs: int | None, seed: int, job
         raise ParameterError(f"The '--rules' must differ. Got {rules}.")
     count = (runs or scenario.default_runs) if scenario.random else 1
     (result,) = results([Study(name, find_scenario, count, seed, rules=specs)], jobs or os.cpu_count() or 1, None)
-    groups = by_filter_and_quantity(result.outcomes)
-    differences = {group: paired_differences(scores) for group, scores in groups.items()}
+    groups = grouped(result.outcomes)
+    conservative = [c.name for c in chosen if c.rule.guarantee == "conservative"]
     if as_json:
-        output.print_json(_as_json(scenario, count, seed, groups, differences))
+        output.print_json(_as_json(scenario, count, seed, groups, conservative))
     else:
-        _print(scenario, count, seed, groups, differences)
+        _print(scenario, count, seed, groups, conservative)
 
 
 def rule_specs(rules: str, params: str) -> tuple[RuleSpec, ...]:
@@ -92,59 +101,84 @@ def rule_specs(rules: str, params: str) -> tuple[RuleSpec, ...]:
     return tuple(map(spec, names))
 
 
-def by_filter_and_quantity(outcomes: Outcomes) -> dict[tuple[str, str], Outcomes]:
-    """Group scores named <filter>-<rule>/<quantity>: {(filter, quantity): {rule: (R,)}}."""
-    groups: dict[tuple[str, str], Outcomes] = {}
-    for name, values in outcomes.items():
-        row, _, quantity = name.rpartition("/")
-        one, _, rule = row.partition("-")
-        groups.setdefault((one, quantity), {})[rule] = values
-    return groups
-
-
 def _as_json(
-    scenario: Scenario, runs: int, seed: int, groups: Mapping[tuple[str, str], Outcomes],
-    differences: Mapping[tuple[str, str], list[Difference]],
-) -> dict[str, Any]:  # fmt: skip
-    from track_fusion.metrics.accuracy import Estimate
+    scenario: Scenario, runs: int, seed: int, groups: Mapping[Group, Outcomes], conservative: Sequence[str]
+) -> dict[str, Any]:
+    from track_fusion.study.comparison import differences, scores
 
+    pairs, rules = differences(groups), scores(groups, conservative)
     quantities = [
         {
-            "filter": one,
-            "quantity": quantity,
-            "rules": [
-                {"rule": rule, "mean": e.value, "standard_error": e.standard_error}
-                for rule, e in ((rule, Estimate.mean(values)) for rule, values in scores.items())
-            ],
-            "differences": [{**vars(d), "significant": d.significant} for d in differences[one, quantity]],
+            "filter": group.filter,
+            "quantity": group.quantity,
+            "kind": group.kind,
+            "rules": [_score_json(score) for score in rules[group]],
+            "differences": [{**vars(d), "significant": d.significant} for d in pairs.get(group, [])],
         }
-        for (one, quantity), scores in groups.items()
+        for group in groups
     ]
     return {"scenario": scenario.key, "runs": runs, "seed": seed, "quantities": quantities}
 
 
+def _score_json(score: Score) -> dict[str, Any]:
+    described = {
+        "rule": score.rule,
+        "mean": score.mean.value,
+        "standard_error": score.mean.standard_error,
+        "robust_mean": score.robust_mean,
+        "diverged": score.diverged,
+    }
+    if score.distance is None:
+        return described
+    return described | {"distance": score.distance, "consistency": score.consistency}
+
+
 def _print(
-    scenario: Scenario, runs: int, seed: int, groups: Mapping[tuple[str, str], Outcomes],
-    differences: Mapping[tuple[str, str], list[Difference]],
-) -> None:  # fmt: skip
-    from track_fusion.metrics.accuracy import Estimate
+    scenario: Scenario, runs: int, seed: int, groups: Mapping[Group, Outcomes], conservative: Sequence[str]
+) -> None:
+    from track_fusion.study.comparison import differences, scores
+
+    out, pairs = output.console(), differences(groups)
+    out.print(f"[bold]{escape(scenario.key)}[/bold]  {runs} run{'s' * (runs > 1)}, seed {seed}, smaller is better")
+    for group, rules in scores(groups, conservative).items():
+        out.print("", _scores_table(group, rules))
+        if pairs.get(group):
+            out.print(_pairs_table(pairs[group]))
+
+
+def _scores_table(group: Group, rules: Sequence[Score]) -> Table:
+    """Means, and where there is something to say of it the share of diverged runs, or consistency."""
     from track_fusion.report.page import measured_text, quantity_text
 
-    out = output.console()
-    out.print(f"[bold]{escape(scenario.key)}[/bold]  {runs} run{'s' * (runs > 1)}, seed {seed}, smaller is better")
-    for (one, quantity), scores in groups.items():
-        means = output.table("rule", "mean ± standard error", title=f"{one}: {quantity_text(quantity)}")
-        for rule in sorted(scores, key=lambda r: float(scores[r].mean())):
-            mean = Estimate.mean(scores[rule])
-            means.add_row(escape(rule), measured_text(mean.value, mean.standard_error))
-        out.print("", means)
-        pairs = output.table("better", "worse", "by", "p")
-        for d in differences[one, quantity]:
-            by = measured_text(d.mean, d.standard_error)
-            style = "" if d.significant else "dim"
-            pairs.add_row(escape(d.first), escape(d.second), by, _p_text(d), style=style)
-        if pairs.row_count:
-            out.print(pairs)
+    title = f"{group.filter}: {quantity_text(group.quantity)}{NOTES[group.kind]}"
+    extra = {
+        "robust mean": [f"{s.robust_mean:.5g}" for s in rules] if any(s.diverged for s in rules) else [],
+        "diverged": [f"{s.diverged:.1%}" for s in rules] if any(s.diverged for s in rules) else [],
+        "consistency": [s.consistency for s in rules] if group.kind == "consistency" else [],
+    }
+    extra = {name: cells for name, cells in extra.items() if cells}
+    means = output.table("rule", "mean ± standard error", *extra, title=title)
+    for i in sorted(range(len(rules)), key=lambda i: _place(rules[i])):
+        mean = rules[i].mean
+        cells = (column[i] for column in extra.values())
+        means.add_row(escape(rules[i].rule), measured_text(mean.value, mean.standard_error), *cells)
+    return means
+
+
+def _place(score: Score) -> float:
+    place = score.mean.value if score.distance is None else score.distance
+    return place if place - place == 0.0 else float("inf")
+
+
+def _pairs_table(differences: Sequence[Difference]) -> Table:
+    from track_fusion.report.page import measured_text
+
+    pairs = output.table("better", "worse", "by", "p")
+    for d in differences:
+        by = measured_text(d.mean, d.standard_error)
+        p = "diverges" if d.diverges else _p_text(d)
+        pairs.add_row(escape(d.first), escape(d.second), by, p, style="" if d.significant else "dim")
+    return pairs
 
 
 def _p_text(difference: Difference) -> str:

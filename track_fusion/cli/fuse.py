@@ -23,6 +23,12 @@ def fuse(rule: str, params: str) -> None:
       "components"  in place of mean and cov: [{"weight": w, "mean": [...], "cov": [[...]]}, ...]
 
     \b
+    Beside "tracks" may stand
+      "axes"        names of the axes: yaw, heading, course, roll, pitch, bearing, azimuth, elevation are angles in
+                    radians and wrap, all others do not
+      "angular"     names of further axes that are angles in radians
+
+    \b
     Where the rule needs it, and only there (see "needs" in `track-fusion rules`), in each TRACK
       "independent_cov"  the part of "cov" that is independent of the other tracks
       "likelihood"       of the track's measurements
@@ -41,7 +47,7 @@ def fuse(rule: str, params: str) -> None:
       echo '{"tracks": [{"mean": [0, 0], "cov": [[4, 0], [0, 1]]}, {"mean": [1, 0], "cov": [[1, 0], [0, 4]]}]}' |
         track-fusion fuse --rule covariance_intersection --params '{"criterion": "trace"}'
     """  # noqa: D301  click reads \b as "do not wrap"
-    from track_fusion.cli.tracks_json import read_tracks, write_fused
+    from track_fusion.cli.tracks_json import like_angles, read_tracks, write_fused
     from track_fusion.params import from_dict
     from track_fusion.rules import find_rule
 
@@ -50,6 +56,9 @@ def fuse(rule: str, params: str) -> None:
     if sys.stdin.isatty():
         click.echo("Reading tracks from the terminal; end with Ctrl-D.", err=True)
     tracks = read_tracks(sys.stdin.buffer.read(), chosen.needed(settings), chosen.key, chosen.optional)
+    for axis in like_angles(tracks):
+        advice = 'name the axes by "axes" if they are, so that they wrap.'
+        click.echo(f"Note: the numbers of axis {axis} look like angles; {advice}", err=True)
     print_json(write_fused(chosen(tracks, settings)))
 
 

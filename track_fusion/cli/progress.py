@@ -15,8 +15,11 @@ if TYPE_CHECKING:
     from track_fusion.study.study import Result, Study
 
 
-def results(studies: Sequence[Study], jobs: int, store: Path | None) -> Iterator[Result]:
-    """Run studies, showing on a terminal how far each is; yield each's result as it is done."""
+def results(studies: Sequence[Study], jobs: int, store: Path | None, *, told: bool = False) -> Iterator[Result]:
+    """Run studies; yield each's result as it is done.
+
+    A terminal shows how far each is; elsewhere, if `told`, stderr gets a line a study that is done.
+    """
     from track_fusion.study.processes import run_studies
 
     err = console(stderr=True)
@@ -32,4 +35,8 @@ def results(studies: Sequence[Study], jobs: int, store: Path | None) -> Iterator
         err.print(f"Stopping when the pieces at work are done{kept} ...")
 
     with bar if err.is_terminal else contextlib.nullcontext():
-        yield from run_studies(studies, jobs, store, progress, interrupted)
+        for result in run_studies(studies, jobs, store, progress, interrupted):
+            if told and not err.is_terminal:
+                runs = f"{result.study.runs} run{'s' * (result.study.runs > 1)}"
+                err.print(f"{result.study.scenario}: {runs}, {result.took_s:.1f} s of one processor")
+            yield result

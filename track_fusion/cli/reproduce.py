@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,10 +22,16 @@ if TYPE_CHECKING:
 
     from track_fusion.report.page import Section
     from track_fusion.scenarios import Scenario
-    from track_fusion.study.study import Result
+    from track_fusion.study.study import Result, Study
 
 #: Colours of the verdicts in the table.
-STYLES = {"agrees": "green", "ordering only": "yellow", "does not reproduce": "red", "not given": "dim"}
+STYLES = {
+    "agrees": "green",
+    "contradicts": "red",
+    "undecided": "yellow",
+    "by construction": "dim",
+    "not given": "dim",
+}
 
 
 @click.command(short_help="Repeat published studies: measured beside published.")
@@ -32,6 +41,8 @@ STYLES = {"agrees": "green", "ordering only": "yellow", "does not reproduce": "r
     "--runs", type=click.IntRange(min=1), help="Monte Carlo runs.  [default: the scenario's own, a quick look]"
 )
 @click.option("--publication", is_flag=True, help="As many runs as figures to be quoted need (hours for --all).")
+@click.option("--until-decided", "limit", metavar="RUNS", type=click.IntRange(min=1),
+              help="Go on with more runs, up to so many, while a claim or a figure is undecided.")  # fmt: skip
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the random streams.")
 @click.option("--only", default="", metavar="PREFIX", help="Only rows whose names start so, such as kf- (much faster).")
 @click.option(
@@ -41,26 +52,31 @@ STYLES = {"agrees": "green", "ordering only": "yellow", "does not reproduce": "r
               help="Where results.json and report.html, which are replaced, and finished pieces go.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON: one object, or a list of them for several names.")
 def reproduce(
-    names: tuple[str, ...], every: bool, runs: int | None, publication: bool, seed: int, only: str, jobs: int | None,
-    out: Path, as_json: bool,
+    names: tuple[str, ...], every: bool, runs: int | None, publication: bool, limit: int | None, seed: int, only: str,
+    jobs: int | None, out: Path, as_json: bool,
 ) -> None:  # fmt: skip
     """Run published scenarios in the library and set what was measured beside what was published.
 
     NAME is a scenario (`track-fusion scenarios` lists them) or a Python file that defines SCENARIO. Writes
     results.json (figures, claims, the curves of the pictures) and report.html, one page that needs nothing else.
     A run that was interrupted goes on where it was when the same command is given again. Equal seeds give equal
-    figures, but for the times that ahmed-random measures. The verdict on a figure is
+    figures, but for the times that ahmed-random measures. The verdicts are
 
     \b
-      agrees               the difference is within 3 standard deviations, of our runs and the paper's together
-      ordering only        the figure stands to the others of its table as published
-      does not reproduce   neither; of a claim: it is not true of what was measured
-      not given            nothing to compare with, or a single random run, whose error is unknown
+      agrees            a figure within 3 standard deviations, of our runs and the paper's together;
+                        a claim that holds beyond chance: 99.9 %, compared run by run
+      contradicts       a figure further off (its reason may be: in the order published);
+                        a claim that is false beyond chance
+      undecided         these runs cannot tell: a claim within chance or on fewer than 10 runs, a
+                        figure of a single run
+      by construction   it agrees, but no result could contradict it; not counted as agreement
+      not given         nothing to compare with
 
     \b
     Examples:
       track-fusion reproduce li2022-linear
       track-fusion reproduce li2022-linear --only kf- --runs 1000
+      track-fusion reproduce sharma-radars --until-decided 100
       track-fusion reproduce --all --out out/all
       track-fusion reproduce ./my_scenario.py --json
     """  # noqa: D301  click reads \b as "do not wrap"
@@ -83,8 +99,9 @@ def reproduce(
     chosen = tuple(SCENARIOS) if every else tuple(dict.fromkeys(names))
     studies = [Study(name, find_scenario, wanted(find_scenario(name)), seed, only) for name in chosen]
     sections = []
-    for result in results(studies, jobs or os.cpu_count() or 1, out / "pieces"):
-        sections.append(_section(result))
+    run = partial(results, jobs=jobs or os.cpu_count() or 1, store=out / "pieces", told=True)
+    for section in map(_section, run(studies)) if limit is None else _until_decided(studies, limit, run):
+        sections.append(section)
         if not as_json:
             _print_tables(sections[-1])
     _write(out, sections)
@@ -93,6 +110,25 @@ def reproduce(
         output.print_json(answers[0] if len(answers) == 1 else answers)
     else:
         click.echo(f"Written: {out / 'report.html'}, {out / 'results.json'}")
+
+
+def _until_decided(
+    studies: Sequence[Study], limit: int, run: Callable[[Sequence[Study]], Iterator[Result]]
+) -> Iterator[Section]:
+    """Run each study with ever more runs, at most so many, until no verdict is undecided; what is done is kept."""
+    for study in studies:
+        (result,) = run([study])
+        section = _section(result)
+        while section.scenario.random and study.runs < limit and _is_undecided(section):
+            pieces = ceil(2 * study.runs / section.scenario.piece)
+            study = dataclasses.replace(study, runs=min(pieces * section.scenario.piece, limit))
+            (result,) = run([study])
+            section = _section(result)
+        yield section
+
+
+def _is_undecided(section: Section) -> bool:
+    return any(judged["verdict"] == "undecided" for key in ("claims", "figures") for judged in section.result[key])
 
 
 def _section(result: Result) -> Section:
@@ -141,9 +177,7 @@ def _print_tables(section: Section) -> None:
     if result["claims"]:
         claims = output.table("claim", "verdict", title="claims")
         for c in result["claims"]:
-            claims.add_row(
-                escape(f"{c['claim']} ({evidence_text(c['evidence'])})"), f"[{STYLES[c['verdict']]}]{c['verdict']}[/]"
-            )
+            claims.add_row(escape(f"{c['claim']} ({evidence_text(c['evidence'])})"), _verdict(c))
         out.print("", claims)
     out.print()
     facts = [
@@ -160,7 +194,12 @@ def _table(quantity: str, figures: Sequence[Mapping[str, Any]]) -> Table:
     compared = output.table("filter and rule", "measured", "published", "verdict", title=title)
     compared.columns[1].justify = compared.columns[2].justify = "right"
     for f in figures:
-        verdict = f"[{STYLES[f['verdict']]}]{f['verdict']}[/]"
         measured = measured_text(f["value"], f["standard_error"])
-        compared.add_row(escape(f["name"].rpartition("/")[0]), measured, published_text(f["published"]), verdict)
+        compared.add_row(escape(f["name"].rpartition("/")[0]), measured, published_text(f["published"]), _verdict(f))
     return compared
+
+
+def _verdict(judged: Mapping[str, Any]) -> str:
+    from track_fusion.report.page import verdict_text
+
+    return f"[{STYLES[judged['verdict']]}]{escape(verdict_text(judged))}[/]"

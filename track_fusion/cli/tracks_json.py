@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
 
+from track_fusion.angles import HALF_TURN, TURN, periods_of, wrap
 from track_fusion.cli.tracks_schema import InputError, check, shared_schema, tracks_schema
 from track_fusion.densities.mixture.mixture import moments, padded
 from track_fusion.linalg import ASYMMETRY_TOLERANCE, Array, asymmetric, is_positive_definite, outer, symmetrise
 from track_fusion.rules import FusedTracks, Mixture, SourceTracks
 from track_fusion.tracks import WEIGHT_TOLERANCE
 
+#: Within so many standard deviations of their difference two angles are near each other.
+NEAR_SD = 4.0
 #: How far below zero, beside the largest, an eigenvalue of a semi-definite matrix may be by rounding.
 ROUNDING = 1e-9
 
@@ -29,9 +32,10 @@ def read_tracks(text: bytes, needs: Collection[str], rule: str, optional: Collec
 
     Returns
     -------
-    SourceTracks    of one fusion: mean (K, n), cov (K, n, n), and `extras` as arrays: independent_cov (K, n, n),
-                    likelihood (K,), cross_cov (K, K, n, n) whose diagonal blocks are the tracks' own covariances,
-                    common and target as Mixture of (C,), (C, n), (C, n, n) (a Gaussian has one component), seed int
+    SourceTracks    of one fusion: mean (K, n), cov (K, n, n), the periods of its axes where they are named, and
+                    `extras` as arrays: independent_cov (K, n, n), likelihood (K,), cross_cov (K, K, n, n) whose
+                    diagonal blocks are the tracks' own covariances, common and target as Mixture of (C,), (C, n),
+                    (C, n, n) (a Gaussian has one component), seed int
 
     Raises
     ------
@@ -39,13 +43,29 @@ def read_tracks(text: bytes, needs: Collection[str], rule: str, optional: Collec
     """
     data = _parse(text)
     check(data, tracks_schema(_axes(data), needs, rule, optional))
-    tracks = data["tracks"]
-    mixtures = [_mixture(track, f"tracks[{k}]") for k, track in enumerate(tracks)]
-    mean, cov = (np.stack(arrays) for arrays in zip(*map(moments, mixtures), strict=True))
+    tracks, periods = data["tracks"], _periods(data)
+    mixtures = [_mixture(track, f"tracks[{k}]", periods) for k, track in enumerate(tracks)]
+    merged = [moments(mixture, periods) for mixture in mixtures]
+    mean, cov = (np.stack(arrays) for arrays in zip(*merged, strict=True))
     dof = np.array([np.inf if track.get("dof") is None else track["dof"] for track in tracks], float)
     known_dof = dof if np.isfinite(dof).any() else None
     parts = _stacked(mixtures) if any("components" in track for track in tracks) else None
-    return SourceTracks(mean, cov, known_dof, parts, _extras(data, cov))
+    return SourceTracks(mean, cov, known_dof, parts, _extras(data, cov, periods), periods)
+
+
+def like_angles(tracks: SourceTracks) -> list[int]:
+    """Return the axes whose numbers look like angles that nobody named: a turn brings tracks together.
+
+    They lie between plus and minus a turn, two of them far apart as numbers, and near each other on the circle.
+    """
+    if tracks.periods:
+        return []
+    plain = tracks.mean[:, None] - tracks.mean[None]
+    sd = np.sqrt(np.diagonal(tracks.cov, axis1=-2, axis2=-1))
+    reach = NEAR_SD * np.hypot(sd[:, None], sd[None])
+    turned = (np.abs(plain) > np.maximum(reach, HALF_TURN)) & (np.abs(wrap(plain, TURN)) <= reach)
+    small = (np.abs(tracks.mean) <= TURN).all(0)
+    return [int(i) for i in np.flatnonzero(small & turned.any((0, 1)))]
 
 
 def write_fused(fused: FusedTracks) -> dict[str, Any]:
@@ -101,10 +121,25 @@ def _fail(place: str, text: str) -> NoReturn:
     raise InputError(f"{place}: {text}")
 
 
+def _periods(data: Mapping[str, Any]) -> tuple[float, ...]:
+    """Read which axes wrap: those of known names, and those that "angular" names."""
+    if "axes" not in data:
+        if "angular" in data:
+            _fail("axes", "is missing; 'angular' names some of them")
+        return ()
+    axes, angular = data["axes"], data.get("angular", [])
+    if len(set(axes)) < len(axes):
+        _fail("axes", f"must be distinct names; got {json.dumps(axes)}")
+    for k, name in enumerate(angular):
+        if name not in axes:
+            _fail(f"angular[{k}]", f"must be one of the axes {', '.join(axes)}; got {json.dumps(name)}")
+    return periods_of(axes, dict.fromkeys(angular, TURN))
+
+
 # Densities.
 
 
-def _mixture(given: Mapping[str, Any], place: str) -> Mixture:
+def _mixture(given: Mapping[str, Any], place: str, periods: Sequence[float]) -> Mixture:
     """Read {"mean", "cov"} as one component, or {"components"}; all without covariance, these are particles."""
     if "components" not in given:
         cov = _symmetric(given["cov"], f"{place}.cov")
@@ -119,7 +154,7 @@ def _mixture(given: Mapping[str, Any], place: str) -> Mixture:
         for i, cov in enumerate(covs):
             _check_definite(cov, f"{place}[{i}].cov")
     mixture = Mixture(weight, mean, covs).normalised
-    _check_definite(moments(mixture)[1], place)
+    _check_definite(moments(mixture, periods)[1], place)
     return mixture
 
 
@@ -144,7 +179,7 @@ def _stacked(mixtures: list[Mixture]) -> Mixture:
 # What some rules need beyond the tracks.
 
 
-def _extras(data: Mapping[str, Any], cov: Array) -> dict[str, Any]:
+def _extras(data: Mapping[str, Any], cov: Array, periods: Sequence[float]) -> dict[str, Any]:
     """Read all that is there; of what stands in the tracks, what all of them have."""
     extras: dict[str, Any] = {}
     if all("independent_cov" in track for track in data["tracks"]):
@@ -153,7 +188,7 @@ def _extras(data: Mapping[str, Any], cov: Array) -> dict[str, Any]:
     if all("likelihood" in track for track in data["tracks"]):
         extras["likelihood"] = np.array([track["likelihood"] for track in data["tracks"]], float)
     check(data, shared_schema(*cov.shape[:2]))
-    extras |= {name: _mixture(data[name], name) for name in ("common", "target") if name in data}
+    extras |= {name: _mixture(data[name], name, periods) for name in ("common", "target") if name in data}
     extras |= {"cross_cov": _cross_cov(data["cross_cov"], cov)} if "cross_cov" in data else {}
     return extras | ({"seed": data["seed"]} if "seed" in data else {})
 

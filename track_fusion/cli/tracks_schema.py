@@ -88,7 +88,10 @@ def tracks_schema(size: int | None, needs: Collection[str], rule: str, optional:
     track = _density(size, {"dof": dof, **used(extras)}, [name for name in extras if name in needs])
     shared: Schema = dict.fromkeys(("common", "cross_cov", "target", "seed"), {})
     required = ["tracks", *(name for name in shared if name in needs)]
-    return _object({"tracks": _list("a list of tracks", track), **used(shared)}, required)
+    name = {"type": "string", "title": "a name"}
+    names = "a list of names, one an axis" if size is None else f"a list of {size} names, one an axis of tracks[0]"
+    axes = {"axes": _list(names, name, size), "angular": _list("a list of names", name)}
+    return _object({"tracks": _list("a list of tracks", track), **axes, **used(shared)}, required)
 
 
 def shared_schema(count: int, size: int | None) -> Schema:

@@ -1,4 +1,8 @@
-"""What every filter is: parameters alone; all that changes is in its states, and each step returns a new one."""
+"""What every filter is: parameters alone; all that changes is in its states, and each step returns a new one.
+
+Within a filter axes that wrap are unrolled: motions carry a mean of pi + .1 on as they would one of .1 - pi, and
+sensors' residuals are the short way round. Whoever makes a track of a state wraps its mean.
+"""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ class Linearising(GaussianFilter):
         transition : Transition
         """
         slope = transition.jacobian(state.mean) if transition.matrix is None else transition.matrix
-        cov = symmetrise(slope @ state.cov @ transpose(slope) + transition.noise)
+        cov = symmetrise(slope @ state.cov @ transpose(slope) + transition.noise(state.mean))
         return Gaussian(transition.advance(state.mean), cov, state.dof)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from track_fusion.angles import wrap
 from track_fusion.filters.base import Gaussian, GaussianFilter, Innovation
 from track_fusion.linalg import Array, matvec, solve, symmetrise, transpose
 from track_fusion.models.base import Transition
@@ -51,7 +52,7 @@ class Kalman(GaussianFilter):
         """
         if (matrix := transition.matrix) is None:
             raise ValueError("The 'transition' of a Kalman filter must be linear. Got one without a matrix.")
-        cov = symmetrise(matrix @ state.cov @ transpose(matrix) + transition.noise)
+        cov = symmetrise(matrix @ state.cov @ transpose(matrix) + transition.noise(state.mean))
         return Gaussian(matvec(matrix, state.mean), cov, state.dof)
 
     def update(self, state: Gaussian, z: Array, sensor: LinearSensor) -> tuple[Gaussian, Innovation]:
@@ -63,4 +64,7 @@ class Kalman(GaussianFilter):
         z : (..., m)
         sensor : LinearSensor    H (m, n), or one for each state (..., m, n), and R
         """
-        return condition(state, z, sensor.matrix, sensor.noise)
+        gap = z - matvec(sensor.matrix, state.mean)
+        # So many whole turns more or less bring an angle next to what is expected; elsewhere it is nothing at all.
+        turns = wrap(gap, sensor.periods) - gap
+        return condition(state, z + turns, sensor.matrix, sensor.noise)

@@ -13,10 +13,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from track_fusion.angles import sample_moments
 from track_fusion.densities.log_domain import log_of, log_sum_exp
 from track_fusion.densities.mixture.mixture import Mixture
 from track_fusion.filters.base import Density, Evidence
-from track_fusion.linalg import Array, cholesky, sample_moments, transpose
+from track_fusion.linalg import Array, cholesky, transpose
 from track_fusion.models.base import Sensor, Transition
 from track_fusion.params import param
 from track_fusion.random_streams import Generators, RandomParams, exponentials, normals, stream, uniforms
@@ -36,10 +37,12 @@ class Particles:
     ----------
     points : (..., N, n)
     log_weight : (..., N)    logarithms of weights that sum to one
+    periods : (n,)           of axes that wrap, infinite for the others; empty: none wraps
     """
 
     points: Array
     log_weight: Array
+    periods: Sequence[float] = dataclasses.field(default=(), kw_only=True)
     dof: ClassVar[float] = np.inf
 
     @property
@@ -58,7 +61,7 @@ class Particles:
 
         The covariance is that of the weighted samples; it is singular when n or fewer of them carry all weight.
         """
-        return sample_moments(self.weight, self.points)
+        return sample_moments(self.weight, self.points, self.periods)
 
     @property
     def components(self) -> Mixture:
@@ -79,14 +82,14 @@ def union(sets: Sequence[Particles], weights: Array) -> Particles:
 
     Parameters
     ----------
-    sets : K Particles, (..., N_i) each
+    sets : K Particles, (..., N_i) each    of the same periods
     weights : (..., K)    non-negative, sum one
     """
     share = log_of(weights)
     lead = np.broadcast_shapes(*(s.points.shape[:-2] for s in sets), weights.shape[:-1])
     points = [np.broadcast_to(s.points, (*lead, *s.points.shape[-2:])) for s in sets]
     logs = [np.broadcast_to(s.log_weight + share[..., i, None], (*lead, s.count)) for i, s in enumerate(sets)]
-    return Particles(np.concatenate(points, -2), np.concatenate(logs, -1))
+    return Particles(np.concatenate(points, -2), np.concatenate(logs, -1), periods=sets[0].periods)
 
 
 def even(shape: tuple[int, ...]) -> Array:
@@ -100,7 +103,7 @@ def take(particles: Particles, index: NDArray[np.intp]) -> Particles:
     sets = int(np.prod(lead))
     rows = index.reshape(sets, index.shape[-1]) + count * np.arange(sets)[:, None]
     points = particles.points.reshape(sets * count, n)[rows]
-    return Particles(points.reshape(*index.shape, n), even(index.shape))
+    return Particles(points.reshape(*index.shape, n), even(index.shape), periods=particles.periods)
 
 
 def resample_multinomial(particles: Particles, rng: Generators, count: int | None = None) -> Particles:
@@ -154,10 +157,12 @@ class Sir:
     ----------
     params : SirParams
     runs : tuple of int or None    the runs of a batch, (R, ...), each with its stream; None: that of `params.run` alone
+    periods : (n,)                   of axes of the state that wrap; empty: none does
     """
 
     params: SirParams = SirParams()
     runs: tuple[int, ...] | None = None
+    periods: Sequence[float] = ()
 
     def begin(self, mean: Array, cov: Array) -> SirState:
         """Draw particles of equal weights from N(mean, cov), streams from their beginning.
@@ -185,9 +190,10 @@ class Sir:
         """
         if (state.log_weight != state.log_weight[..., :1]).any():
             state = self._resampled(state, state.rng)
-        factor = transition.noise_factor
-        draws = normals(state.rng, (*state.points.shape[:-1], factor.shape[-1]))
-        return SirState(transition.advance(state.points) + draws @ factor.T, state.log_weight, state.rng)
+        points = state.points
+        draws = normals(state.rng, (*points.shape[:-1], transition.noise_factor(points).shape[-1]))
+        moved = transition.advance(points) + transition.disturbance(points, draws)
+        return dataclasses.replace(state, points=moved)
 
     def update(self, state: SirState, z: Array, sensor: Sensor) -> tuple[SirState, Evidence]:
         """Weigh the particles by their likelihood of z = h(x) + v.
@@ -207,13 +213,13 @@ class Sir:
         scale = np.log(np.diagonal(lower)).sum() + 0.5 * LOG_2PI * len(lower)
         joint = state.log_weight - 0.5 * (white**2).sum(-1) - scale
         total = log_sum_exp(joint)
-        return SirState(state.points, joint - total[..., None], state.rng), Evidence(total)
+        return dataclasses.replace(state, log_weight=joint - total[..., None]), Evidence(total)
 
     def _drawn(self, mean: Array, cov: Array, rng: Generators) -> SirState:
         draws = normals(rng, (*mean.shape[:-1], self.params.particles, mean.shape[-1]))
         points = mean[..., None, :] + draws @ transpose(cholesky(cov))
-        return SirState(points, even(points.shape[:-1]), rng)
+        return SirState(points, even(points.shape[:-1]), rng, periods=self.periods)
 
     def _resampled(self, particles: Particles, rng: Generators) -> SirState:
         drawn = RESAMPLING[self.params.resampling](particles, rng, self.params.particles)
-        return SirState(drawn.points, drawn.log_weight, rng)
+        return SirState(drawn.points, drawn.log_weight, rng, periods=self.periods)

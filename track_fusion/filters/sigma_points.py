@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
+from track_fusion.angles import OPPOSITE, within_half_circle
 from track_fusion.filters.base import Gaussian, GaussianFilter, Innovation
 from track_fusion.linalg import Array, cholesky, matvec, solve, symmetrise, transpose
 from track_fusion.models.base import Sensor, Transition
@@ -40,11 +41,41 @@ class SigmaPoints:
 
 
 def expected_measurement(mean: Array, sigma: Array, sensor: Sensor, points: SigmaPoints) -> tuple[Array, Array]:
-    """Return the expected measurement (..., m) and its deviations at the points (..., P, m), angles wrapped."""
+    """Return the expected measurement (..., m) and its deviations at the points (..., P, m), angles unrolled."""
     reference = sensor.observe(mean)
-    turned = sensor.residual(sensor.observe(sigma), reference[..., None, :])
+    turned = unrolled(mean, sigma, reference, sensor)
     shift = points.mean(turned)
     return reference + shift, turned - shift[..., None, :]
+
+
+def unrolled(mean: Array, sigma: Array, reference: Array, sensor: Sensor) -> Array:
+    """Return by how much the points' measurements differ from that of the mean, (..., P, m).
+
+    The short way round may be the wrong one for an axis of the state itself: where a difference was wrapped, it is
+    summed over two steps, to the point halfway and from there. So a direction whose standard deviation is 90 degrees
+    is measured as if it did not wrap, up to points a whole turn away.
+
+    Raises
+    ------
+    LinAlgError    measured directions, other than axes of the state, lie beyond a half circle: the points surround
+                   the sensor
+    """
+    seen = sensor.observe(sigma)
+    turned = sensor.residual(seen, reference[..., None, :])
+    if np.array_equal(turned, seen - reference[..., None, :]):
+        unwrapped = turned
+    else:
+        halfway = sensor.observe(0.5 * (sigma + mean[..., None, :]))
+        unwrapped = sensor.residual(halfway, reference[..., None, :]) + sensor.residual(seen, halfway)
+    beyond = ~within_half_circle(unwrapped, sensor.periods)
+    if beyond.any():
+        straight = (sigma - mean[..., None, :]) @ transpose(sensor.jacobian(mean))
+        bent = np.isfinite(sensor.periods) & (np.abs(unwrapped - straight) > OPPOSITE)
+        if (beyond & bent.any((-2, -1))).any():
+            raise np.linalg.LinAlgError(
+                "The sigma points surround the sensor: what they measure has no mean direction."
+            )
+    return unwrapped
 
 
 class SigmaPointFilter(GaussianFilter, ABC):
@@ -67,13 +98,13 @@ class SigmaPointFilter(GaussianFilter, ABC):
         origin = moved[..., :1, :]
         shift = points.mean(moved - origin)
         deviation = moved - origin - shift[..., None, :]
-        cov = symmetrise(points.cross(deviation, deviation) + transition.noise)
+        cov = symmetrise(points.cross(deviation, deviation) + transition.noise(state.mean))
         return Gaussian(origin[..., 0, :] + shift, cov, state.dof)
 
     def update(self, state: Gaussian, z: Array, sensor: Sensor) -> tuple[Gaussian, Innovation]:
         """Condition on z = h(x) + v by the joint Gaussian that the points give.
 
-        Angles are averaged about the measurement of the mean and wrapped. The posterior covariance is summed from the
+        Angles are averaged about the measurement of the mean. The posterior covariance is summed from the
         points' remaining deviations, so that it stays definite when all weights are positive.
 
         Parameters

@@ -73,7 +73,7 @@ class SquareRootCubature:
         moved = transition.advance(rule.of(state.mean, state.root))
         shift = rule.mean(moved - moved[..., :1, :])
         deviation = moved - moved[..., :1, :] - shift[..., None, :]
-        root = triangular_root(_beside(_scaled(deviation), transition.noise_factor))
+        root = triangular_root(_beside(_scaled(deviation), transition.noise_factor(state.mean)))
         return GaussianRoot(moved[..., 0, :] + shift, root)
 
     def update(self, state: GaussianRoot, z: Array, sensor: Sensor) -> tuple[GaussianRoot, Innovation]:

@@ -9,17 +9,31 @@ import numpy as np
 
 from track_fusion.linalg import Array
 
-#: So many standard errors from a bound leave no doubt on which side a figure lies.
-BEYOND_DOUBT = 3.0
+#: What a run that goes another way than all runs seen has at most as its probability, when they are unanimous: the
+#: complement of this is the confidence that it is not more frequent.
+UNSEEN = 5e-4
 
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """A figure measured by Monte Carlo: value, standard error (NaN for one run), number of runs."""
+    """A figure measured by Monte Carlo.
+
+    Attributes
+    ----------
+    value : float
+    standard_error : float    NaN for one run, 0 where nothing random goes in
+    runs : int
+    left_out : (R,) or None   the figure without each of the runs in turn, in the order of the runs: figures of the same
+                              runs pair up run by run. None: nothing random goes in, or it is not known
+    unseen : float            how far the figure may be from the truth although all runs have the same: that of a share
+                              of 0 or 1; positive upwards
+    """
 
     value: float
     standard_error: float
     runs: int
+    left_out: Array | None = dataclasses.field(default=None, compare=False, repr=False)
+    unseen: float = 0.0
 
     @classmethod
     def exact(cls, value: float) -> Estimate:
@@ -30,20 +44,42 @@ class Estimate:
     def mean(cls, values: Array) -> Estimate:
         """Average over runs, (R,); where all runs have the same value, that value without rounding."""
         values = np.asarray(values, float)
-        if len(values) > 1 and (values == values[0]).all():
-            return cls(float(values[0]), 0.0, len(values))
-        error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else float("nan")
-        return cls(float(values.mean()), float(error), len(values))
+        runs = len(values)
+        if runs > 1 and (values == values[0]).all():
+            return cls(float(values[0]), 0.0, runs, values)
+        if runs < 2:
+            return cls(float(values.mean()), float("nan"), runs)
+        error = values.std(ddof=1) / np.sqrt(runs)
+        return cls(float(values.mean()), float(error), runs, (values.sum() - values) / (runs - 1))
+
+    @classmethod
+    def share(cls, values: Array) -> Estimate:
+        """Average over runs of something between 0 and 1, (R,), a share or whether something happened.
+
+        When all runs say 0, or all 1, it may still happen sometimes: with a probability of up to 1 - UNSEEN^(1/R).
+        """
+        of_runs = cls.mean(values)
+        if of_runs.standard_error != 0.0 or of_runs.value not in (0.0, 1.0):
+            return of_runs
+        doubt = 1.0 - UNSEEN ** (1.0 / of_runs.runs)
+        return dataclasses.replace(of_runs, unseen=doubt * (1.0 - 2.0 * of_runs.value))
 
     @classmethod
     def median(cls, values: Array) -> Estimate:
-        """Median over runs, (R,); standard error: half the distance of the order statistics one binomial sd away."""
-        values, runs = np.sort(np.asarray(values, float)), len(values)
+        """Median over runs, (R,); standard error: half the distance of the order statistics one binomial sd away.
+
+        To leave a run out moves the middle by one order statistic whichever run it is, so that the jackknife fails.
+        `left_out` is what the influence function of the median gives: each run moves it by the same amount, up or down
+        by the side on which it lies, the amount being that which goes with the standard error.
+        """
+        values = np.asarray(values, float)
+        runs, middle = len(values), float(np.median(values))
         if runs < 2:
-            return cls(float(np.median(values)), float("nan"), runs)
+            return cls(middle, float("nan"), runs)
         ranks = np.clip([(runs - 1 - np.sqrt(runs)) / 2, (runs - 1 + np.sqrt(runs)) / 2], 0, runs - 1)
-        low, high = np.interp(ranks, np.arange(runs), values)
-        return cls(float(np.median(values)), float(0.5 * (high - low)), runs)
+        low, high = np.interp(ranks, np.arange(runs), np.sort(values))
+        error = float(0.5 * (high - low))
+        return cls(middle, error, runs, middle - np.sign(values - middle) * error * np.sqrt(runs) / (runs - 1))
 
     @classmethod
     def of_averages(cls, values: Array, statistic: Callable[[Array], Array]) -> Estimate:
@@ -58,18 +94,14 @@ class Estimate:
         value = float(statistic(values.mean(0)[None])[0])
         if runs < 2:
             return cls(value, float("nan"), runs)
-        left_out = statistic((values.sum(0) - values) / (runs - 1))
+        left_out = np.asarray(statistic((values.sum(0) - values) / (runs - 1)))
         variance = (runs - 1) / runs * ((left_out - left_out.mean()) ** 2).sum()
-        return cls(value, float(np.sqrt(variance)), runs)
+        return cls(value, float(np.sqrt(variance)), runs, left_out)
 
     @classmethod
     def ratio(cls, numerator: Array, denominator: Array) -> Estimate:
         """Ratio of two averages over the same runs, (R,) each."""
         return cls.of_averages(np.stack([numerator, denominator], -1), lambda mean: mean[:, 0] / mean[:, 1])
-
-    def exceeds(self, bound: float) -> bool:
-        """Tell whether the figure is above a bound beyond doubt: by more than BEYOND_DOUBT standard errors."""
-        return bool(self.value - BEYOND_DOUBT * np.nan_to_num(self.standard_error) > bound)
 
     def spread(self, runs: int) -> float:
         """Standard deviation that the figure would have in a study of so many runs."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
+from track_fusion.angles import difference
 from track_fusion.association.assignment import nearest_pairs
 from track_fusion.association.gate import Indices
 from track_fusion.linalg import Array
@@ -30,8 +29,7 @@ def paired(layout: StateLayout, truth: Array, mean: Array, cov: Array, reach_m: 
     truth : (N, n)                     states of the targets
     mean, cov : (M, n), (M, n, n)      of the tracks
     """
-    at, turned = list(layout.position), layout.angular
+    at = list(layout.position)
     target, track = nearest_pairs(truth[:, at], mean[:, at], reach_m)
-    error = mean[track] - truth[target]
-    error[:, turned] = np.remainder(error[:, turned] + np.pi, 2 * np.pi) - np.pi
+    error = difference(mean[track], truth[target], layout.periods)
     return Pairs(target, track, error, nees(error, cov[track]))

@@ -10,6 +10,7 @@ import numpy as np
 
 from track_fusion.linalg import Array, asymmetric, is_positive_definite
 from track_fusion.models.base import Motion, Sensor
+from track_fusion.models.constant_turn_rate_and_speed import ConstantTurnRateAndSpeed, TurnRateAndSpeedParams
 from track_fusion.models.measurement import LinearSensor, RangeBearingSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams, KnownTurn, KnownTurnParams
@@ -50,6 +51,7 @@ MOTIONS: Registry[Choice[Motion]] = Registry(
         "nearly_constant_velocity": Choice(MotionParams, NearlyConstantVelocity),
         "coordinated_turn": Choice(CoordinatedTurnParams, CoordinatedTurn),
         "known_turn": Choice(KnownTurnParams, KnownTurn),
+        "constant_turn_rate_and_speed": Choice(TurnRateAndSpeedParams, ConstantTurnRateAndSpeed),
     },
 )
 
@@ -97,13 +99,12 @@ def _linear(layout: StateLayout, params: LinearParams) -> LinearSensor:
     axes = params.sensor_axes
     if not axes or len(set(axes)) < len(axes):
         raise ParameterError(f"The 'sensor_axes' parameter must hold distinct axes, at least one. Got {list(axes)}.")
-    matrix = np.eye(layout.size)[list(layout.indices(axes))]
-    noise = square_matrix("sensor_cov", params.sensor_cov, len(matrix))
+    noise = square_matrix("sensor_cov", params.sensor_cov, len(axes))
     if not np.isfinite(noise).all() or asymmetric(noise) or not is_positive_definite(noise):
         raise ParameterError(
             f"The 'sensor_cov' parameter must be symmetric and positive definite. Got {list(params.sensor_cov)}."
         )
-    return LinearSensor(axes, matrix, noise)
+    return LinearSensor.reading(layout, axes, noise)
 
 
 #: Sensors by key, made from (layout, params).

@@ -3,35 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from track_fusion.angles import TURN, difference, periods_of
+from track_fusion.layouts import StateLayout
 from track_fusion.linalg import Array
-from track_fusion.tracks import StateLayout
 
 #: Distances are not taken shorter than this when dividing by them: at the sensor itself derivatives are zero.
 SHORTEST_M = 1e-100
-
-
-def wrap_angle(angle: Array) -> Array:
-    """Bring angles in radians to [-pi, pi); those that lie there stay as they are, to the last digit."""
-    angle = np.asarray(angle)
-    outside = (angle < -np.pi) | (angle >= np.pi)
-    if not outside.any():
-        return angle
-    turned = (angle + np.pi) % (2.0 * np.pi) - np.pi
-    turned = np.where(turned < np.pi, turned, -np.pi)  # the remainder of a tiny negative number is 2 pi itself
-    return np.where(outside, turned, angle)
-
-
-def wrapped_residual(z: Array, expected: Array, angular: NDArray[np.bool_]) -> Array:
-    """Return z - expected, (..., m), where `angular` (m,) wrapped to [-pi, pi)."""
-    residual = np.asarray(z - expected)
-    for i in np.flatnonzero(angular):
-        residual[..., i] = wrap_angle(residual[..., i])
-    return residual
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,21 +23,33 @@ class LinearSensor:
     axes : tuple of str    what a detection holds
     matrix : (m, n)        H
     noise : (m, m)         R, squared SI units
+    periods : (m,)         of angular axes, infinite for the others; empty: as the names say
     """
 
     axes: tuple[str, ...]
     matrix: Array
     noise: Array
+    periods: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.periods:
+            object.__setattr__(self, "periods", periods_of(self.axes))
+
+    @classmethod
+    def reading(cls, layout: StateLayout, axes: tuple[str, ...], noise: Array) -> LinearSensor:
+        """Make a sensor that reads some axes of a layout as they are, with noise (m, m).
+
+        Raises
+        ------
+        ValueError    an axis is missing
+        """
+        return cls(axes, np.eye(layout.size)[list(layout.indices(axes))], noise, layout.part(axes).periods)
 
     @classmethod
     def position(cls, layout: StateLayout, sd: float) -> LinearSensor:
         """Make a sensor of all position axes with standard deviation sd in metres, as Li 2022 (48)."""
         axes = tuple(layout.axes[i] for i in layout.position)
-        return cls(axes, np.eye(layout.size)[list(layout.position)], sd**2 * np.eye(len(axes)))
-
-    @cached_property
-    def _angular(self) -> NDArray[np.bool_]:
-        return StateLayout(self.axes).angular
+        return cls.reading(layout, axes, sd**2 * np.eye(len(axes)))
 
     def observe(self, state: Array) -> Array:
         """Return H x, (..., n) -> (..., m)."""
@@ -69,7 +61,7 @@ class LinearSensor:
 
     def residual(self, z: Array, expected: Array) -> Array:
         """Return z - expected, (..., m), angles wrapped."""
-        return wrapped_residual(z, expected, self._angular)
+        return difference(z, expected, self.periods)
 
 
 def _location(location: tuple[float, ...], axes: int) -> Array:
@@ -99,7 +91,7 @@ class RangeBearingSensor:
     """
 
     axes = ("range", "bearing")
-    _angular = np.array([False, True])
+    periods = (np.inf, TURN)
 
     def __init__(
         self, layout: StateLayout, range_sd: float, bearing_sd: float, location: tuple[float, ...] = ()
@@ -126,7 +118,7 @@ class RangeBearingSensor:
 
     def residual(self, z: Array, expected: Array) -> Array:
         """Return z - expected, (..., 2), the bearing wrapped."""
-        return wrapped_residual(z, expected, self._angular)
+        return difference(z, expected, self.periods)
 
     def positions(self, z: Array, noise: Array | None = None) -> tuple[Array, Array]:
         """Turn detections into positions (..., 2) with covariances (..., 2, 2), by linearisation.
@@ -156,6 +148,7 @@ class RangeRangeRateSensor:
     """
 
     axes = ("range", "range_rate")
+    periods = (np.inf, np.inf)
 
     def __init__(
         self,

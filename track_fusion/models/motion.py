@@ -8,10 +8,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from track_fusion.layouts import StateLayout
 from track_fusion.linalg import Array
 from track_fusion.models.base import Transition
+from track_fusion.models.random_walk import random_walk, random_walk_param
 from track_fusion.params import Params, param
-from track_fusion.tracks import StateLayout
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,25 +31,30 @@ class MotionParams(Params):
         "deviation of the acceleration in m/s^2 (piecewise_constant)",
         low=0.0,
     )
+    random_walk_noise: tuple[float, ...] = random_walk_param()
 
 
 class NearlyConstantVelocity:
     """Nearly constant velocity over a layout that holds each position axis with its velocity.
 
-    Axes without a partner (yaw, ...) are refused: this model says nothing of them.
+    Other axes (yaw, length, ...) follow a random walk, in either form of the noise. A position or a velocity without
+    its partner, or an acceleration, is refused.
 
     References     Li 2022 (47) for piecewise_constant.
     """
 
     def __init__(self, layout: StateLayout, params: MotionParams) -> None:
         names = layout.axes
-        pairs = [(names.index(a), names.index("v" + a)) for a in ("x", "y", "z") if a in names and "v" + a in names]
-        if not pairs or 2 * len(pairs) != layout.size:
-            raise ValueError(f"Nearly constant velocity needs axes like x, vx in pairs. Got {', '.join(names)}.")
-        self.layout, self.params, self._pairs = layout, params, pairs
+        paired = [a for a in ("x", "y", "z") if a in names and "v" + a in names]
+        own = [*paired, *("v" + a for a in paired)]
+        wanted = "Nearly constant velocity needs axes like x, vx in pairs"
+        self._walk = random_walk(layout, own, params.random_walk_noise, wanted)
+        self.layout, self.params = layout, params
+        self._pairs = [(names.index(a), names.index("v" + a)) for a in paired]
+        self._others = [i for i, a in enumerate(names) if a not in own]
         position, velocity = np.zeros((layout.size,) * 2), np.zeros((layout.size,) * 2)
         cross, self._drift = np.zeros((layout.size,) * 2), np.zeros((layout.size,) * 2)
-        for p, v in pairs:
+        for p, v in self._pairs:
             position[p, p] = velocity[v, v] = cross[p, v] = cross[v, p] = self._drift[p, v] = 1.0
         self._noise = np.stack([position, cross, velocity])
         self.matrices = lru_cache(maxsize=256)(self._matrices)
@@ -74,7 +80,7 @@ class NearlyConstantVelocity:
             terms = strength * np.stack([dt**3 / 3, dt**2 / 2, dt], -1)
         else:
             terms = strength**2 * np.stack([dt**4 / 4, dt**3 / 2, dt**2], -1)
-        return transition, np.tensordot(terms, self._noise, 1)
+        return transition, np.tensordot(terms, self._noise, 1) + dt[:, None, None] * np.diag(self._walk)
 
     def noise_factor(self, dt: float) -> Array:
         """Return G, (n, r), with G G' = Q over dt seconds and r draws an interval: what a simulation needs."""
@@ -89,6 +95,7 @@ class NearlyConstantVelocity:
                 second = np.zeros(self.layout.size)
                 second[v] = np.sqrt(noise[v, v] - first[v] ** 2)
                 columns.append(second)
+        columns += list(np.diag(np.sqrt(dt * self._walk))[self._others])
         return np.stack(columns, 1)
 
     def _over(self, dt: float) -> Transition:

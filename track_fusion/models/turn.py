@@ -7,12 +7,13 @@ from functools import lru_cache
 
 import numpy as np
 
+from track_fusion.layouts import StateLayout
 from track_fusion.linalg import Array
 from track_fusion.models.base import Transition
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
+from track_fusion.models.random_walk import random_walk, random_walk_param
 from track_fusion.models.van_loan import van_loan
 from track_fusion.params import Params, param
-from track_fusion.tracks import StateLayout
 
 #: Angles below this, in radians, use series: closed forms lose digits there.
 SMALL_ANGLE = 0.1
@@ -29,6 +30,7 @@ class CoordinatedTurnParams(Params):
     turn_rate_noise: float = param(
         1e-4, "power spectral density of the white turn acceleration: variance a second", unit="rad^2/s^3", low=0.0
     )
+    random_walk_noise: tuple[float, ...] = random_walk_param()
 
 
 def turn_coefficients(angle: Array) -> tuple[Array, Array]:
@@ -56,16 +58,16 @@ class CoordinatedTurn:
     """Coordinated turn over axes x, y, vx, vy and turn_rate, in any order; the turn rate is a state.
 
     The velocity turns by turn_rate dt, positive from x towards y. Noise is added to a nearly constant
-    velocity of each axis and to the turn rate, without correlation.
+    velocity of each axis and to the turn rate, without correlation. Other axes follow a random walk.
 
     References     Li 2022 (49), with F(turn rate before the step) and its limit at turn rate zero.
     """
 
     def __init__(self, layout: StateLayout, params: CoordinatedTurnParams) -> None:
-        if set(layout.axes) != {*PLANE, "turn_rate"}:
-            raise ValueError(f"Coordinated turn needs axes x, y, vx, vy, turn_rate. Got {', '.join(layout.axes)}.")
+        own, wanted = (*PLANE, "turn_rate"), "Coordinated turn needs axes x, y, vx, vy, turn_rate"
+        self._walk = random_walk(layout, own, params.random_walk_noise, wanted)
         self.layout, self.params = layout, params
-        self._at = layout.indices((*PLANE, "turn_rate"))
+        self._at = layout.indices(own)
         self.over = lru_cache(maxsize=256)(self._over)
 
     def _over(self, dt: float) -> Transition:
@@ -76,25 +78,26 @@ class CoordinatedTurn:
         ValueError    dt is negative
         """
         straight = NearlyConstantVelocity(StateLayout(PLANE), MotionParams(process_noise=self.params.process_noise))
-        size, plane, rate = self.layout.size, list(self._at[:4]), self._at[4]
-        noise, (_, block), factor = np.zeros((size, size)), straight.matrices(dt), straight.noise_factor(dt)
+        plane, (_, block), factor = list(self._at[:4]), straight.matrices(dt), straight.noise_factor(dt)
+        alone = dt * self._walk  # variances of the axes that gain noise by themselves
+        alone[self._at[4]] = dt * self.params.turn_rate_noise
+        noise = np.diag(alone)
         noise[np.ix_(plane, plane)] = block
-        noise[rate, rate] = self.params.turn_rate_noise * dt
-        root = np.zeros((size, factor.shape[1] + 1))
-        root[plane, :-1], root[rate, -1] = factor, np.sqrt(noise[rate, rate])
-        return Transition(lambda x: self._advance(x, dt), lambda x: self._jacobian(x, dt), noise, root)
+        others = [i for i in range(self.layout.size) if i not in plane]
+        root = np.concatenate([np.zeros((self.layout.size, factor.shape[1])), np.diag(np.sqrt(alone))[:, others]], 1)
+        root[plane, : factor.shape[1]] = factor
+        return Transition.additive(lambda x: self._advance(x, dt), lambda x: self._jacobian(x, dt), noise, root)
 
     def _advance(self, state: Array, dt: float) -> Array:
         x, y, vx, vy, rate = (state[..., i] for i in self._at)
         angle = rate * dt
         along, across = turn_coefficients(angle)
         cosine, sine = np.cos(angle), np.sin(angle)
-        moved = np.empty_like(state)
+        moved = np.array(state)
         moved[..., self._at[0]] = x + dt * (along * vx - across * vy)
         moved[..., self._at[1]] = y + dt * (across * vx + along * vy)
         moved[..., self._at[2]] = cosine * vx - sine * vy
         moved[..., self._at[3]] = sine * vx + cosine * vy
-        moved[..., self._at[4]] = rate
         return moved
 
     def _jacobian(self, state: Array, dt: float) -> Array:
@@ -125,29 +128,29 @@ class KnownTurnParams(Params):
     process_noise: float = param(
         1.0, "power spectral density of the white acceleration of each axis", unit="m^2/s^3", low=0.0
     )
+    random_walk_noise: tuple[float, ...] = random_walk_param()
 
 
 class KnownTurn:
     """Velocity turning at a known rate over axes x, y, vx, vy in any order: linear, noise by van Loan.
 
-    At rate zero it is nearly constant velocity.
+    At rate zero it is nearly constant velocity. Other axes follow a random walk.
 
     References     Ahmed (59)-(60) and the text below (62).
     """
 
     def __init__(self, layout: StateLayout, params: KnownTurnParams) -> None:
-        if set(layout.axes) != set(PLANE):
-            raise ValueError(f"A turn of known rate needs axes x, y, vx, vy. Got {', '.join(layout.axes)}.")
+        walk = random_walk(layout, PLANE, params.random_walk_noise, "A turn of known rate needs axes x, y, vx, vy")
         self.layout, self.params = layout, params
         x, y, u, v = layout.indices(PLANE)
-        self._drift, self._diffusion = np.zeros((4, 4)), np.zeros((4, 4))
+        self._drift, self._diffusion = np.zeros((layout.size, layout.size)), np.diag(walk)
         self._drift[x, u] = self._drift[y, v] = 1.0
         self._drift[u, v], self._drift[v, u] = -params.turn_rate, params.turn_rate
         self._diffusion[u, u] = self._diffusion[v, v] = params.process_noise
         self.matrices = lru_cache(maxsize=256)(self._matrices)
 
     def _matrices(self, dt: float) -> tuple[Array, Array]:
-        """Return F and Q, each (4, 4), over dt seconds."""
+        """Return F and Q, each (n, n), over dt seconds."""
         return van_loan(self._drift, self._diffusion, dt)
 
     def over(self, dt: float) -> Transition:

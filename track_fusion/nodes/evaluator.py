@@ -19,7 +19,6 @@ from track_fusion.nodes.process import end, run
 from track_fusion.nodes.ros_params import declare
 from track_fusion.nodes.screening import FrameParams, screened_tracks
 from track_fusion.params import Params, param
-from track_fusion.tracks import StateLayout
 
 #: How often the end of the run is looked for, wall time.
 LOOK_PERIOD_S = 0.1
@@ -52,7 +51,7 @@ class EvaluatorNode(ManagedNode):
         """Declare parameters."""
         self.frame, self.params = declare(self, FrameParams), declare(self, EvaluatorParams)
         self._truth: Any = None
-        self.layout, self.kind = StateLayout(self.frame.axes), MESSAGE_TYPES[self.params.truth_type]
+        self.layout, self.kind = self.frame.layout, MESSAGE_TYPES[self.params.truth_type]
         self._evaluation_params = declare(self, EvaluationParams)
         self.finished = self._had_truth = False
         self._foreign = ""

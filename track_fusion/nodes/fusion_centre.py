@@ -38,7 +38,7 @@ from track_fusion.params import ParameterError, Params, param
 from track_fusion.plugins import Registry
 from track_fusion.random_streams import RandomParams
 from track_fusion.rules import RULES
-from track_fusion.tracks import StateLayout, TrackBatch
+from track_fusion.tracks import TrackBatch
 
 #: Message types of sources by key, those of other packages included.
 SOURCE_TYPES: Registry[MessageType] = Registry("track_fusion.adapters", "source type", MessageType, MESSAGE_TYPES)
@@ -93,7 +93,7 @@ class FusionCentreNode(ManagedNode):
         """Declare parameters and build the centre."""
         self.frame, self.sources = declare(self, FrameParams), declare(self, SourceParams)
         self.kinds = self.sources.kinds
-        motion = chosen(self, MOTIONS, declare(self, MotionChoice).motion, StateLayout(self.frame.axes))
+        motion = chosen(self, MOTIONS, declare(self, MotionChoice).motion, self.frame.layout)
         rule = RULES[declare(self, StateFusionParams).state_fusion]
         refuse_of_others(self, RULES, "state_fusion", rule.key)
         rule_params = declare(self, rule.params, f"{rule.key}.")
@@ -177,6 +177,7 @@ class FusionCentreNode(ManagedNode):
             self.counted["steps"] += 1
             self.counted["unconverged"] += result.info.unconverged
             self.counted["unsound"] += result.info.unsound
+            self.counted["beyond_half_circle"] += result.info.beyond_half_circle
             self.counted["deleted"] += len(result.info.changes.deleted)
             began = time.perf_counter()
 
@@ -202,6 +203,8 @@ class FusionCentreNode(ManagedNode):
                 warnings.append(f"{name} is silent for {silence:.1f} s")
         if unsound := self.counted["unsound"]:
             warnings.append(f"{unsound} fusions gave no density; a single source was taken instead")
+        if beyond := self.counted["beyond_half_circle"]:
+            warnings.append(f"{beyond} fusions were of angles more than a half circle apart, which have no mean")
         if self._last is not None:
             values["members"] = self._last.members.tolist()
             if self._last.shared_provenance and rule.guarantee_at(self.centre.config.rule_params) != "conservative":

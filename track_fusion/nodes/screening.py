@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters.arrays import DetectionArrays, MessageError, TrackArrays
+from track_fusion.angles import KNOWN_PERIODS, TURN, periods_of
 from track_fusion.linalg import Array, is_positive_definite, symmetrise
-from track_fusion.params import Params, param
+from track_fusion.params import ParameterError, Params, param
 from track_fusion.tracks import ABSURD, SECOND_NS, StateLayout, TrackBatch
 
 if TYPE_CHECKING:
@@ -23,9 +24,26 @@ class FrameParams(Params):
 
     frame_id: str = param("map", "frame of every state; messages in another frame are rejected")
     axes: tuple[str, ...] = param(("x", "y", "vx", "vy"), "axes of the state, in order")
+    angular: tuple[str, ...] = param(
+        (),
+        "further axes that are angles in radians and wrap at pi, beside those of known names: "
+        + ", ".join(KNOWN_PERIODS),
+        kind=str,
+    )
     max_future_s: float = param(
         0.5, "reject messages stamped further ahead of the node's clock than this", unit="s", low=0.0
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in self.angular:
+            if name not in self.axes:
+                raise ParameterError(f"The 'angular' parameter must name axes of {', '.join(self.axes)}. Got {name!r}.")
+
+    @property
+    def layout(self) -> StateLayout:
+        """The axes, and which of them wrap."""
+        return StateLayout(self.axes, periods_of(self.axes, dict.fromkeys(self.angular, TURN)))
 
     @property
     def max_future_ns(self) -> int:

@@ -30,7 +30,7 @@ from track_fusion.trackers.one_target import (
     SensorTrackerParams,
     TrackerChoice,
 )
-from track_fusion.tracks import SECOND_NS, StateLayout, TrackBatch
+from track_fusion.tracks import SECOND_NS, TrackBatch
 
 #: How often a tracker that waits for feedback looks at its deadline.
 LOOK_PERIOD_S = 0.05
@@ -75,7 +75,7 @@ class SensorTrackerNode(ManagedNode):
 
     def _made(self, choice: TrackerChoice) -> SensorTracker | PdaTracker:
         """Declare the parameters of motion, sensor and filter, and make the tracker of them."""
-        motion = chosen(self, MOTIONS, choice.motion, StateLayout(self.frame.axes))
+        motion = chosen(self, MOTIONS, choice.motion, self.frame.layout)
         sensor = chosen(self, SENSORS, choice.sensor, motion.layout)
         if choice.filter != MULTI_TARGET:
             track_filter = chosen(self, FILTERS, choice.filter, motion, sensor)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -27,7 +28,7 @@ class Fuse(Protocol[T]):
         """
 
 
-def by_rule(rule: Rule, params: Params | None = None, seed: int = 0) -> Fuse[Mixture]:
+def by_rule(rule: Rule, params: Params | None = None, seed: int = 0, periods: Sequence[float] = ()) -> Fuse[Mixture]:
     """Fuse by one of the rules; Gaussian tracks are mixtures of one component, (..., 1).
 
     Parameters
@@ -36,6 +37,7 @@ def by_rule(rule: Rule, params: Params | None = None, seed: int = 0) -> Fuse[Mix
                        Gaussian rules fuse the moments of mixtures
     params : Params    None = the rule's defaults
     seed : int         of rules that draw random numbers: the k-th message of a peer meets the k-th stream
+    periods : (n,)     of axes that wrap, infinite for the others; empty: none wraps
 
     Raises
     ------
@@ -54,6 +56,6 @@ def by_rule(rule: Rule, params: Params | None = None, seed: int = 0) -> Fuse[Mix
             raise ValueError(f"The rule '{rule.key}' {state} the common information of a channel filter.")
         extras = {"seed": np.random.default_rng([seed, count]), "common": common}
         used = {k: v for k, v in extras.items() if k in (*rule.needed(params), *rule.optional)}
-        return rule.fuse(SourceTracks.of(stacked(own, heard), **used), params).density
+        return rule.apply(SourceTracks.of(stacked(own, heard), periods, **used), params).density
 
     return fuse

@@ -13,7 +13,7 @@ from track_fusion.report.drawing import svg
 from track_fusion.study.chart import Chart
 from track_fusion.study.scenario import Printed, Scenario
 
-VERDICTS = ("agrees", "ordering only", "does not reproduce", "not given")
+VERDICTS = ("agrees", "contradicts", "undecided", "by construction", "not given")
 #: Units whose names in figures lack signs.
 UNITS = {"mps": "m/s", "degps": "deg/s", "m2": "m²", "m4": "m⁴", "k": "K", "k2": "K²"}
 #: Tables without published figures that are longer than this are folded.
@@ -41,9 +41,9 @@ th, td { text-align: left; padding: .18rem .9rem .18rem 0; border-bottom: 1px so
 .number { text-align: right; }
 td.number { white-space: nowrap; }
 .agrees { color: #0b6b34; }
-.ordering-only { color: #80590a; }
-.does-not-reproduce { color: #a61b1b; }
-.not-given { color: #53616e; }
+.undecided { color: #80590a; }
+.contradicts { color: #a61b1b; }
+.by-construction, .not-given { color: #53616e; }
 .tables { display: flex; flex-wrap: wrap; gap: 0 3rem; align-items: flex-start; }
 .tables > * { max-width: 100%; }
 .charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(22rem, 100%), 1fr)); gap: 1rem; }
@@ -91,10 +91,11 @@ def page(sections: Sequence[Section], made_by: str) -> str:
 
 def _explained() -> str:
     meanings = {
-        "agrees": "within 3 standard deviations of the difference, the error of both studies and the rounding of the "
-        "print together",
-        "ordering only": "it stands to every other row of its table as published",
-        "does not reproduce": "neither; of a claim: it is not true of what was measured",
+        "agrees": "a figure within 3 standard deviations of the difference, the error of both studies and the rounding "
+        "of the print together; a claim that holds beyond chance (99.9 %, the runs being paired)",
+        "contradicts": "a figure further off; a claim that is false beyond chance",
+        "undecided": "these runs cannot tell: a claim within chance or on fewer than ten runs, a figure of one run",
+        "by construction": "it agrees, but no result could contradict it; not counted as agreement",
         "not given": "the paper prints nothing to compare with",
     }
     return " ".join(f"<b class='{_class(verdict)}'>{verdict}</b>: {text}." for verdict, text in meanings.items())
@@ -105,14 +106,18 @@ def _overview(sections: Sequence[Section]) -> str:
     for result, scenario, _, _ in sections:
         figures = Counter(f["verdict"] for f in result["figures"])
         claims = Counter(c["verdict"] for c in result["claims"])
-        told = f"{claims['agrees']} of {sum(claims.values())}" if claims else ""
-        cells = [f"<td class='number {_class(v)}'>{figures[v] or ''}</td>" for v in VERDICTS]
         name = f"<a href='#{escape(scenario.key)}'>{escape(scenario.key)}</a>"
-        rows.append(f"<tr><td class='name'>{name}</td>{''.join(cells)}<td class='number'>{told}</td></tr>")
+        cells = [
+            f"<td class='number {_class(v)}'>{' + '.join((str(figures[v] or '–'), str(claims[v] or '–')))}</td>"
+            if figures[v] or claims[v]
+            else "<td></td>"
+            for v in VERDICTS
+        ]
+        rows.append(f"<tr><td class='name'>{name}</td>{''.join(cells)}</tr>")
     heads = "".join(f"<th class='number'>{v}</th>" for v in VERDICTS)
     return (
-        "<div class='scroll'><table><caption>Figures by verdict, and claims that hold</caption>"
-        f"<tr><th>scenario</th>{heads}<th class='number'>claims</th></tr>{''.join(rows)}</table></div>"
+        "<div class='scroll'><table><caption>Figures + claims by verdict</caption>"
+        f"<tr><th>scenario</th>{heads}</tr>{''.join(rows)}</table></div>"
     )
 
 
@@ -149,7 +154,7 @@ def _claims(claims: Sequence[Mapping[str, Any]]) -> str:
         return ""
     rows = [
         f"<tr><td>{escape(c['claim'])}<div class='quiet'>{escape(c['source'])}; {_evidence(c['evidence'])}</div></td>"
-        f"<td class='{_class(c['verdict'])}'>{escape(c['verdict'])}</td></tr>"
+        f"{_verdict_cell(c)}</tr>"
         for c in claims
     ]
     head = "<tr><th>claim</th><th>verdict</th></tr>"
@@ -211,7 +216,7 @@ def _table(quantity: str, rows: Sequence[Mapping[str, Any]]) -> str:
         f"<tr><td class='name'>{_breakable(f['name'].rpartition('/')[0])}</td>"
         f"<td class='number'>{measured_text(f['value'], f['standard_error'])}</td>"
         f"<td class='number'>{published_text(f['published'])}</td>"
-        f"<td class='{_class(f['verdict'])}'>{escape(f['verdict'])}</td></tr>"
+        f"{_verdict_cell(f)}</tr>"
         for f in rows
     )
     return (
@@ -261,6 +266,15 @@ def _base64(text: str) -> str:
 def _breakable(name: str) -> str:
     """Let a long name go on in the next line behind an underscore."""
     return escape(name).replace("_", "_<wbr>")
+
+
+def verdict_text(judged: Mapping[str, Any]) -> str:
+    """Write a verdict with its reason, where there is one."""
+    return f"{judged['verdict']}: {judged['reason']}" if judged["reason"] else str(judged["verdict"])
+
+
+def _verdict_cell(judged: Mapping[str, Any]) -> str:
+    return f"<td class='{_class(judged['verdict'])}'>{escape(verdict_text(judged))}</td>"
 
 
 def _class(verdict: str) -> str:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from track_fusion import angles
 from track_fusion.densities.mixture.mixture import Mixture as Mixture
 from track_fusion.densities.mixture.mixture import gaussian, moments
 from track_fusion.linalg import Array, asymmetric, is_positive_definite, symmetrise
@@ -32,7 +34,9 @@ class SourceTracks:
     dof : (..., K) or None     degrees of freedom of Student-t tracks; None = all Gaussian
     mixture : Mixture or None  weight (..., K, C), mean (..., K, C, n), cov (..., K, C, n, n);
                                `mean` and `cov` are then its merged moments
-    extras : mapping           what a rule needs beyond the tracks, under the names in its `needs`
+    extras : mapping           what a rule needs beyond the tracks, under the names in its `needs`; densities among
+                               them, a Mixture or several, are in the tracks' axes
+    periods : (n,)             of axes that wrap, infinite for the others; empty: none wraps
     """
 
     mean: Array
@@ -40,11 +44,39 @@ class SourceTracks:
     dof: Array | None = None
     mixture: Mixture | None = None
     extras: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    periods: Sequence[float] = ()
 
     @classmethod
-    def of(cls, densities: Mixture, **extras: Any) -> SourceTracks:
+    def of(cls, densities: Mixture, periods: Sequence[float] = (), **extras: Any) -> SourceTracks:
         """Make tracks of K mixtures (..., K, C); those of one component are Gaussian tracks."""
-        return cls(*moments(densities), mixture=densities if densities.count > 1 else None, extras=extras)
+        mixture = densities if densities.count > 1 else None
+        return cls(*moments(densities, periods), mixture=mixture, extras=extras, periods=periods)
+
+    @property
+    def wraps(self) -> bool:
+        """Whether an axis wraps."""
+        return any(map(math.isfinite, self.periods))
+
+    def relative_to(self, reference: Array) -> SourceTracks:
+        """Tell the tracks, and the densities among the extras, relative to states (..., n): no axis wraps any more.
+
+        Components stay around the mean of their track, also where that lies half a circle away.
+        """
+        mean = angles.difference(self.mean, reference[..., None, :], self.periods)
+
+        def around(densities: Mixture, old: Array, new: Array) -> Mixture:
+            gap = angles.difference(densities.mean, old[..., None, :], self.periods)
+            return dataclasses.replace(densities, mean=new[..., None, :] + gap)
+
+        def extra(value: Any) -> Any:
+            if isinstance(value, Mixture):
+                return around(value.broadcast(self.batch), reference, np.zeros_like(reference))
+            several = isinstance(value, Sequence) and not isinstance(value, str)
+            return [extra(one) for one in value] if several else value
+
+        mixture = self.mixture and around(self.mixture, self.mean, mean)
+        extras = {name: extra(value) for name, value in self.extras.items()}
+        return SourceTracks(mean, self.cov, self.dof, mixture, extras)
 
     @property
     def count(self) -> int:
@@ -96,7 +128,9 @@ class FusedTracks:
     weights : (..., K) or None     fusion weights (omega)
     dof : (...) or None            None = Gaussian
     mixture : Mixture or None      the fused mixture, when the rule keeps one
-    info : mapping                 arrays of diagnostics: `converged`, `iterations`, ...
+    info : mapping                 arrays of diagnostics: `converged`, `iterations`, ...; where axes wrap, also
+                                   `beyond_half_circle` (...): the tracks had no mean direction and were fused about the
+                                   most certain one
     """
 
     mean: Array
@@ -110,6 +144,14 @@ class FusedTracks:
     def density(self) -> Mixture:
         """The fused mixture, or the Gaussian of the moments, of one component."""
         return gaussian(self.mean, self.cov) if self.mixture is None else self.mixture
+
+    def put_back(self, reference: Array, periods: Sequence[float]) -> FusedTracks:
+        """Undo :meth:`SourceTracks.relative_to`: add the states (..., n), and wrap."""
+        mixture = self.mixture
+        if mixture is not None:
+            mean = angles.shifted(reference[..., None, :], mixture.mean, periods)
+            mixture = dataclasses.replace(mixture, mean=mean)
+        return dataclasses.replace(self, mean=angles.shifted(reference, self.mean, periods), mixture=mixture)
 
 
 Values = Mapping[str, Any]
@@ -163,7 +205,7 @@ class Rule:
     example: Example = Example()
 
     def __call__(self, tracks: SourceTracks, params: Params | None = None) -> FusedTracks:
-        """Check the tracks, then fuse them; `fuse` alone trusts them, for callers that screened them before.
+        """Check the tracks, then :meth:`apply` the rule.
 
         Raises
         ------
@@ -174,7 +216,24 @@ class Rule:
         missing = [name for name in self.needed(params) if name not in tracks.extras]
         if missing:
             raise ValueError(f"The rule '{self.key}' needs '{missing[0]}' beside the tracks. Got none.")
-        return self.fuse(tracks, params)
+        return self.apply(tracks, params)
+
+    def apply(self, tracks: SourceTracks, params: Params) -> FusedTracks:
+        """Fuse tracks that were screened before; `fuse` itself knows nothing of axes that wrap.
+
+        Where some wrap, it is given the tracks relative to the most certain of them, and what it returns is put back.
+
+        Raises
+        ------
+        LinAlgError    a covariance is not positive definite
+        """
+        if not tracks.wraps:
+            return self.fuse(tracks, params)
+        reference = angles.most_certain(tracks.mean, tracks.cov)
+        flat = tracks.relative_to(reference)
+        fused = self.fuse(flat, params).put_back(reference, tracks.periods)
+        beyond = ~angles.within_half_circle(flat.mean, tracks.periods)
+        return dataclasses.replace(fused, info={**fused.info, "beyond_half_circle": beyond})
 
     def guarantee_at(self, params: Params | None = None) -> Guarantee:
         """Return what is guaranteed at these parameters; None: at their defaults."""
@@ -203,7 +262,7 @@ def check_tracks(tracks: SourceTracks) -> None:
     Raises
     ------
     ValueError    a shape does not fit, no source, a value is not finite, a covariance not symmetric or
-                  not positive definite, dof not above 2, a weight of a mixture negative
+                  not positive definite, dof not above 2, a weight of a mixture negative, a period not positive
     """
     mean, cov = tracks.mean, tracks.cov
     if mean.ndim < 2 or mean.shape[-2] < 1 or mean.shape[-1] < 1:
@@ -219,6 +278,11 @@ def check_tracks(tracks: SourceTracks) -> None:
         raise ValueError(
             f"The 'cov' of source tracks must be positive definite: {(~good).sum()} of {good.size} are not. "
             f"Smallest eigenvalue: {lowest:.3g}."
+        )
+    if tracks.periods and (len(tracks.periods) != mean.shape[-1] or not all(p > 0 for p in tracks.periods)):
+        raise ValueError(
+            f"The 'periods' of source tracks must be {mean.shape[-1]} numbers > 0, infinite where an axis does not "
+            f"wrap. Got {tuple(tracks.periods)}."
         )
     if tracks.dof is not None:
         _check_shape("dof", tracks.dof, mean.shape[:-1])

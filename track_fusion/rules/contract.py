@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from track_fusion import angles
 from track_fusion.densities.mixture.mixture import moments, padded
 from track_fusion.linalg import Array, symmetrise, transpose
 from track_fusion.params import specs
@@ -28,6 +29,8 @@ DIFFERENT = 1e-3
 DRAWS, TELLING = 25, 0.7
 #: What a covariance is held to.
 HELD = ("conservative", "exact")
+#: Periods of the axes where the last is a direction; such tracks are drawn with this share of their spread along it.
+PERIODS, NARROW = (*(np.inf,) * (AXES - 1), angles.TURN), 0.1
 
 
 class Verdict(NamedTuple):
@@ -179,23 +182,47 @@ def order_of_sources(case: Case, rng: Rng) -> None:
         _same("sources in another order", second, first, case.tolerance(first, 1e-8))
 
 
+def _moved(tracks: SourceTracks, matrix: Array, shift: Array) -> SourceTracks:
+    """Tracks in the axes x' = matrix x + shift, (n, n), (n,) or (K, n)."""
+    mixture = tracks.mixture
+    if mixture is not None:
+        cov = symmetrise(matrix @ mixture.cov @ matrix.T)
+        mixture = _shifted(Mixture(mixture.weight, mixture.mean @ matrix.T, cov), shift[..., None, :])
+    return SourceTracks(tracks.mean @ matrix.T + shift, symmetrise(matrix @ tracks.cov @ matrix.T), tracks.dof, mixture)
+
+
+def _shifted(densities: Mixture, shift: Array) -> Mixture:
+    return dataclasses.replace(densities, mean=densities.mean + shift)
+
+
 @_in_each_case((2, 3, 5))
 def affine_equivariance(case: Case, rng: Rng) -> None:
     """In other axes and units the result is the same, unless that is denied, and then it is another."""
     tracks = case.tracks(rng, (20,))
     matrix, shift = np.diag([1e-3, 1.0, 30.0, 1e3]) @ rng.normal(size=(AXES, AXES)), rng.normal(size=AXES)
-
-    def move(mean: Array, cov: Array) -> tuple[Array, Array]:
-        return mean @ matrix.T + shift, symmetrise(matrix @ cov @ matrix.T)
-
-    mixture = tracks.mixture and Mixture(tracks.mixture.weight, *move(tracks.mixture.mean, tracks.mixture.cov))
-    here = case.fuse(tracks)
-    there = case.fuse(case.equipped(SourceTracks(*move(tracks.mean, tracks.cov), tracks.dof, mixture)))
-    moved = FusedTracks(*move(here.mean, here.cov))
+    here, there = case.fuse(tracks), case.fuse(case.equipped(_moved(tracks, matrix, shift)))
+    moved = FusedTracks(here.mean @ matrix.T + shift, symmetrise(matrix @ here.cov @ matrix.T))
     if case.rule.affine_equivariant is False or case.values in case.example.not_equivariant:
         _different("other axes", there, moved)
     else:
         _same("other axes", there, moved, case.tolerance(there, 1e-7))
+
+
+@_in_each_case((1, 2, 3, 5))
+def axes_that_wrap(case: Case, rng: Rng) -> None:
+    """Turning all tracks turns the result, its covariance unchanged; whole turns of some of them change nothing."""
+    tracks = case.equipped(_moved(case.tracks(rng, (20,)), np.diag([*(1.0,) * (AXES - 1), NARROW]), np.zeros(AXES)))
+    flat, direction = case.fuse(tracks), np.eye(AXES)[-1]
+    exact = 1e-9 if {"iterations", "ess"} & set(flat.info) else 1e-12
+    for name, turn in (("no turn", 0.0 * direction), ("half a turn", np.pi * direction), ("2 rad", -2.0 * direction)):
+        whole = angles.TURN * np.arange(case.count)[:, None] * direction
+        extras = {k: _shifted(v, turn) if isinstance(v, Mixture) else v for k, v in tracks.extras.items()}
+        turned = _moved(tracks, np.eye(AXES), turn + whole)
+        there = case.fuse(dataclasses.replace(turned, extras=extras, periods=PERIODS))
+        back = dataclasses.replace(there, mean=angles.difference(there.mean, turn, PERIODS))
+        _same(name, back, flat, exact)
+        require((np.abs(there.mean[..., -1]) <= np.pi).all(), f"{name}: expected a direction in [-pi, pi].")
+        require(not there.info["beyond_half_circle"].any(), f"{name}: expected no tracks beyond a half circle.")
 
 
 def guarantee(rule: Rule, example: Example, rng: Rng) -> str | None:
@@ -289,6 +316,6 @@ def counter_example(rule: Rule, example: Example, rng: Rng) -> str | None:
 
 
 LAWS: tuple[Law, ...] = (
-    described, sound, batch_equals_loop, copies_of_a_track, order_of_sources, affine_equivariance, guarantee, linearity,
-    counter_example, tails, numbers_of_targets, particles,
+    described, sound, batch_equals_loop, copies_of_a_track, order_of_sources, affine_equivariance, axes_that_wrap,
+    guarantee, linearity, counter_example, tails, numbers_of_targets, particles,
 )  # fmt: skip

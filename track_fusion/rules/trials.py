@@ -159,7 +159,7 @@ class Case:
             mixture = dataclasses.replace(mixture.broadcast((len(means), sources)), mean=moved)
         cov = np.broadcast_to(tracks.cov, (len(means), *tracks.cov.shape))
         dof = None if tracks.dof is None else np.broadcast_to(tracks.dof, means.shape[:-1])
-        fused = self.rule.fuse(self.equipped(SourceTracks(means, cov, dof, mixture)), self.params)
+        fused = self.rule.apply(self.equipped(SourceTracks(means, cov, dof, mixture)), self.params)
         gain = fused.mean[1:-1].T - fused.mean[0][:, None]
         off = np.abs(gain @ trial.reshape(-1) - fused.mean[-1]).max()
         require(off <= 1e-7, f"mean: expected linear in the means of the tracks, got one {off:.2g} off.")

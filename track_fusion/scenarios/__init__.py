@@ -12,7 +12,7 @@ from track_fusion.scenarios.sharma import gaussians, mixtures, network_1, networ
 from track_fusion.study.judgement import judged_claims, judged_figures
 from track_fusion.study.rows import Outcomes
 from track_fusion.study.rule_choice import RuleChoice
-from track_fusion.study.scenario import Claim, Scenario
+from track_fusion.study.scenario import Scenario
 from track_fusion.study.scene import Scene, Tracking
 
 _MODULES = (
@@ -50,7 +50,6 @@ def find_scenario(name: str) -> Scenario:
 
 __all__ = [
     "SCENARIOS",
-    "Claim",
     "Outcomes",
     "RuleChoice",
     "Scenario",

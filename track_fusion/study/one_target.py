@@ -97,11 +97,11 @@ def same_filters(one: TrackFilter[Gaussian, Transition, Array, Any, Any]) -> Fil
     return Filters(lambda draws, name: one, alike=True)
 
 
-def sir_filters(params: SirParams) -> Filters:
+def sir_filters(params: SirParams, periods: Sequence[float] = ()) -> Filters:
     """Give each sensor a particle filter with a stream of its own in each run."""
 
     def of(draws: Draws, name: str) -> Sir:
-        return Sir(dataclasses.replace(params, seed=draws.seed, role=f"sir {name}"), tuple(draws.runs))
+        return Sir(dataclasses.replace(params, seed=draws.seed, role=f"sir {name}"), tuple(draws.runs), periods)
 
     return Filters(of, alike=False, chunk=SIR_CHUNK)
 
@@ -138,7 +138,7 @@ def fused_row(tracking: Tracking, filters: Filters, choice: RuleChoice, join: bo
         def fuse(tracks: Sequence[Sequence[TrackState]]) -> tuple[FusedTracks, Density]:
             states = [state for each in tracks for state in each]
             means, covs = (np.stack(part, 1) for part in zip(*(_moments(tracking, s) for s in states), strict=True))
-            fused = fuse_runs(choice, means, covs, rngs, float(states[0].dof))
+            fused = fuse_runs(choice, means, covs, rngs, float(states[0].dof), tracking.layout.periods)
             if not join:
                 return fused, Gaussian(fused.mean, fused.cov)
             assert fused.weights is not None
@@ -170,8 +170,9 @@ def sir_rows(tracking: Tracking, sir: SirParams, choices: Sequence[RuleChoice]) 
 
     Without fusion also by multinomial resampling, whose draws are independent and add more noise.
     """
-    filters = sir_filters(sir)
-    noisier = sir_filters(dataclasses.replace(sir, resampling="multinomial"))
+    periods = tracking.layout.periods
+    filters = sir_filters(sir, periods)
+    noisier = sir_filters(dataclasses.replace(sir, resampling="multinomial"), periods)
     table = {"sir-alone": alone_row(tracking, filters, 1), "sir-ic": alone_row(tracking, filters, 2)}
     table |= {f"{row}@multinomial": alone_row(tracking, noisier, i) for i, row in enumerate(list(table), 1)}
     for choice in choices:

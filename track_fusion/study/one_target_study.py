@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from track_fusion.angles import difference
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate, armse, rmse
 from track_fusion.rules import FusedTracks
@@ -101,8 +102,9 @@ class OneTargetStudy:
 
     def _keep(self, into: Outcomes, fused: FusedTracks, truth: Array) -> None:
         """Write what one step gives, (R, ...), into views of what is kept of it."""
+        error = difference(fused.mean, truth, self.tracking.layout.periods)
         for q in self.quantities:
-            into[q.error][...] = (fused.mean - truth)[:, q.axes] * q.factor
+            into[q.error][...] = error[:, q.axes] * q.factor
         axes = self.quantities[0].axes
         into[CLAIMED][...] = np.diagonal(fused.cov, axis1=-2, axis2=-1)[:, axes].sum(-1)
         if WEIGHT in into:
@@ -110,16 +112,19 @@ class OneTargetStudy:
             into[WEIGHT][...] = fused.weights[:, 0]
 
     def scores(self, rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
-        """Root of the time-averaged squared error of each run, (R,), under rules of any family, with feedback."""
+        """Errors of each run, (R,), under rules of any family, with feedback: root of the time-averaged square.
+
+        Of the position also consistency: the squared error over its claim, each averaged over time.
+        """
         name, row = self.compared
-        outcomes = self._run({f"{name}-{choice.name}": row(choice) for choice in rules}, runs, seed, progress)
-        return {
-            f"{name}-{choice.name}/{q.name}_rmse_{q.unit}": np.sqrt(
-                _squares(outcomes[f"{name}-{choice.name}/{q.error}"]).mean(1)
-            )
-            for choice in rules
-            for q in self.quantities
-        }
+        rows = {f"{name}-{choice.name}": row(choice) for choice in rules}
+        outcomes, scores = self._run(rows, runs, seed, progress), {}
+        for one in rows:
+            for q in self.quantities:
+                scores[f"{one}/{q.name}_rmse_{q.unit}"] = np.sqrt(_squares(outcomes[f"{one}/{q.error}"]).mean(1))
+            ratio = self._position_squares(outcomes, one).mean(1) / outcomes[f"{one}/{CLAIMED}"].mean(1)
+            scores[f"{one}/consistency_position_1"] = ratio
+        return scores
 
     def figures(self, outcomes: Outcomes) -> dict[str, Estimate]:
         """ARMSE of each quantity; of the position what the covariance claims, and claimed over actual; weights.

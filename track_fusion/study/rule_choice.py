@@ -39,7 +39,7 @@ class RuleChoice:
 
     def fuse(self, tracks: SourceTracks) -> FusedTracks:
         """Fuse tracks that are known to be sound."""
-        return self.rule.fuse(tracks, self.params)
+        return self.rule.apply(tracks, self.params)
 
 
 def fuse_runs(
@@ -48,6 +48,7 @@ def fuse_runs(
     cov: Array,
     rngs: Sequence[np.random.Generator] | None = None,
     dof: float = math.inf,
+    periods: Sequence[float] = (),
 ) -> FusedTracks:
     """Fuse the tracks of R runs, covariances that all runs share only once.
 
@@ -57,6 +58,7 @@ def fuse_runs(
     cov : (R, K, n, n), or (1, K, n, n) where all runs have the same
     rngs : one generator a run, or None    for a rule that samples: each run then draws its own numbers
     dof : float    degrees of freedom of every track
+    periods : (n,)    of axes that wrap; empty: none does
 
     Returns
     -------
@@ -65,13 +67,13 @@ def fuse_runs(
     Notes    A linear rule gives sum of A_i x_i; fusing unit vectors gives its matrices A_i.
     """
     runs, count, n = mean.shape
-    if len(cov) < runs and choice.rule.linear:
+    if len(cov) < runs and choice.rule.linear and not np.isfinite(periods).any():
         units = np.eye(count * n).reshape(-1, count, n)
         fused = choice.fuse(SourceTracks(units, np.repeat(cov, len(units), 0)))
         weights = None if fused.weights is None else fused.weights[:1]
         return FusedTracks(matvec(transpose(fused.mean), mean.reshape(runs, -1)), fused.cov[:1], weights)
     dofs = np.full((runs, count), dof) if math.isfinite(dof) else None
-    tracks = SourceTracks(mean, np.broadcast_to(cov, (runs, count, n, n)), dofs)
+    tracks = SourceTracks(mean, np.broadcast_to(cov, (runs, count, n, n)), dofs, periods=periods)
     if rngs is None or not choice.random:
         return choice.fuse(tracks)
     each = [choice.fuse(_one_run(tracks, r, rng)) for r, rng in enumerate(rngs)]
@@ -83,7 +85,7 @@ def fuse_runs(
 def _one_run(tracks: SourceTracks, run: int, rng: np.random.Generator) -> SourceTracks:
     at = slice(run, run + 1)
     dof = None if tracks.dof is None else tracks.dof[at]
-    return SourceTracks(tracks.mean[at], tracks.cov[at], dof, extras={"seed": rng})
+    return SourceTracks(tracks.mean[at], tracks.cov[at], dof, extras={"seed": rng}, periods=tracks.periods)
 
 
 def check_needs(choices: Sequence[RuleChoice], given: Collection[str] = ()) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.study.chart import Chart
+from track_fusion.study.claim import Claim
 from track_fusion.study.rows import Outcomes, Progress
 from track_fusion.study.rule_choice import RuleChoice, check_needs
 from track_fusion.study.scene import Scene, Tracking
@@ -25,59 +26,6 @@ class Printed(float):
     text: str
 
 
-@dataclasses.dataclass(frozen=True)
-class Claim:
-    """Something a paper claims that is no single figure, and how it is judged.
-
-    Attributes
-    ----------
-    text, source : str      the claim in our words; where it stands
-    needs : tuple of str    names of the figures that decide it
-    holds : callable        their Estimates, in this order -> whether the claim is true of them
-    """
-
-    text: str
-    source: str
-    needs: tuple[str, ...]
-    holds: Callable[..., bool]
-
-    @classmethod
-    def order(cls, text: str, source: str, *needs: str) -> Claim:
-        """Claim that the figures ascend strictly."""
-
-        def holds(*estimates: Estimate) -> bool:
-            values = [e.value for e in estimates]
-            return all(a < b for a, b in zip(values, values[1:], strict=False))
-
-        return cls(text, source, needs, holds)
-
-    @classmethod
-    def each(
-        cls, text: str, source: str, first: Sequence[str], second: Sequence[str], holds: Callable[[float, float], bool]
-    ) -> Claim:
-        """Claim that figures stand so to their counterparts, one by one."""
-
-        def all_hold(*estimates: Estimate) -> bool:
-            pairs = zip(estimates[: len(first)], estimates[len(first) :], strict=True)
-            return all(holds(a.value, b.value) for a, b in pairs)
-
-        return cls(text, source, (*first, *second), all_hold)
-
-    @classmethod
-    def least(cls, text: str, source: str, figure: str, others: Sequence[str]) -> Claim:
-        """Claim that a figure is less than each of some others."""
-        return cls(text, source, (figure, *others), lambda first, *rest: all(first.value < e.value for e in rest))
-
-    @classmethod
-    def greatest(cls, text: str, source: str, figure: str, others: Sequence[str], times: float = 1.0) -> Claim:
-        """Claim that a figure exceeds so many times each of some others."""
-
-        def holds(first: Estimate, *rest: Estimate) -> bool:
-            return all(first.value > times * e.value for e in rest)
-
-        return cls(text, source, (figure, *others), holds)
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Scenario:
     """A published scenario.
@@ -90,6 +38,7 @@ class Scenario:
     key, title, paper          identification
     shows : str                what one learns from it
     published : mapping        figure name -> value as printed: Printed where the print ends in a zero
+    chosen : tuple             those of its figures that agree because an assumption was chosen so
     published_runs : int       Monte Carlo runs behind the published figures
     default_runs : int         runs for a quick look; 1 where nothing is random
     publication_runs : int     runs for figures to be quoted
@@ -118,6 +67,7 @@ class Scenario:
     figures: Callable[[Outcomes], dict[str, Estimate]]
     charts: Callable[[Outcomes], list[Chart]]
     published: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    chosen: tuple[str, ...] = ()
     published_runs: int = 1
     default_runs: int = 1
     publication_runs: int = 1

@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from track_fusion.angles import wrap
 from track_fusion.linalg import Array, matvec
 from track_fusion.models.base import Motion, Sensor
 from track_fusion.models.noise import Noise
@@ -95,13 +96,14 @@ class Tracking:
         """Draw the target's states of several runs, (R, T + 1, n)."""
         steps = self.steps if steps is None else steps
         transition = self.motion.over(self.dt_s)
-        factor = transition.noise_factor
-        draws = np.stack([self.process_noise.draw(seed, run, "truth", steps, factor.shape[1]) for run in runs])
+        size = transition.noise_factor(self.initial_mean).shape[-1]
+        draws = np.stack([self.process_noise.draw(seed, run, "truth", steps, size) for run in runs])
         states = np.empty((len(runs), steps + 1, len(self.initial_mean)))
         states[:, 0] = [self._initial(seed, run) for run in runs]
         for k in range(steps):
             # One matrix a run: products of larger ones round differently with the number of runs.
-            states[:, k + 1] = transition.advance(states[:, k, None])[:, 0] + matvec(factor, draws[:, k])
+            moved, factor = transition.advance(states[:, k, None])[:, 0], transition.noise_factor(states[:, k])
+            states[:, k + 1] = moved + matvec(factor, draws[:, k])
         return states
 
     def _initial(self, seed: int, run: int) -> Array:
@@ -117,5 +119,5 @@ class Tracking:
             factor = np.linalg.cholesky(sensor.noise)
             draws = self.measurement_noise.draw(seed, run, name, len(truth) - 1, len(factor))
             z = sensor.observe(truth[1:]) + draws @ factor.T
-            seen[name] = sensor.residual(z, np.zeros_like(z))  # angles wrapped
+            seen[name] = wrap(z, sensor.periods)
         return seen

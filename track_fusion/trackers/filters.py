@@ -37,6 +37,6 @@ FILTERS: Mapping[str, Choice[OneTargetFilter]] = {
     "extended": Choice(Params, lambda motion, sensor, params: Extended()),
     "unscented": Choice(UnscentedParams, lambda motion, sensor, params: Unscented(params)),
     "cubature": Choice(Params, lambda motion, sensor, params: Cubature()),
-    "particle": Choice(SirParams, lambda motion, sensor, params: Sir(params)),
+    "particle": Choice(SirParams, lambda motion, sensor, params: Sir(params, periods=motion.layout.periods)),
     "student_t": Choice(StudentTParams, lambda motion, sensor, params: StudentT(params)),
 }

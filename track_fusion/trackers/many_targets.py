@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, triu
 
+from track_fusion.angles import difference, wrap
 from track_fusion.association.boxes import points_in_boxes
 from track_fusion.filters.base import Gaussian
 from track_fusion.filters.extended import Extended
@@ -126,7 +127,7 @@ class PdaTracker:
         """
         dt_s = 0.0 if self.time_ns < 0 else (time_ns - self.time_ns) / SECOND_NS
         self.time_ns = time_ns
-        values = self.sensor.residual(values, np.zeros_like(values))  # bearings wrapped
+        values = wrap(values, self.sensor.periods)
         tracks, claimed = self._updated(self._filter.predict(self.tracks, self.motion.over(dt_s)), values)
         free = values[~claimed]
         self.tracks = dataclasses.replace(self._begun(tracks, free, dt_s), leftover=free)
@@ -169,7 +170,8 @@ class PdaTracker:
         owner = coo_array((np.ones(len(row), np.int32), (row, col)), shape=shape).tocsr()
         pairs = triu(owner @ owner.T, 1).tocoo()
         old, new = pairs.row.astype(np.intp), pairs.col.astype(np.intp)
-        distance = mahalanobis_squared(tracks.mean[old] - tracks.mean[new], tracks.cov[old] + tracks.cov[new])
+        gap = difference(tracks.mean[old], tracks.mean[new], self.layout.periods)
+        distance = mahalanobis_squared(gap, tracks.cov[old] + tracks.cov[new])
         same = distance <= chi_square_quantile(self.params.merge_probability, self.motion.layout.size)
         newer_stays = tracks.confirmed[new] & ~tracks.confirmed[old]
         return np.where(newer_stays, old, new)[same]
@@ -202,7 +204,7 @@ class PdaTracker:
         if not len(tracks.mean):
             return TrackBatch.empty(self.motion.layout, self.frame_id)
         return TrackBatch.gaussian(
-            self.motion.layout, self.frame_id, tracks.mean, tracks.cov,
+            self.layout, self.frame_id, wrap(tracks.mean, self.layout.periods), tracks.cov,
             time_ns=self.time_ns, track_id=tracks.track_id, existence=tracks.existence, status=CONFIRMED,
         )  # fmt: skip
 

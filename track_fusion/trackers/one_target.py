@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from track_fusion.angles import difference, wrap
 from track_fusion.densities.log_domain import log_of
 from track_fusion.filters.base import Density, Gaussian, TrackState
 from track_fusion.filters.particle import Particles
@@ -143,8 +144,9 @@ class SensorTracker:
     def _shown(self, state: TrackState, time_ns: int, status: int = CONFIRMED) -> TrackBatch:
         parts = state.components
         return self._blank.replace(
-            weight=parts.weight[None], mean=parts.mean[None], cov=parts.cov[None], dof=np.array([state.dof]),
-            time_ns=np.array([time_ns]), status=np.array([status], np.uint8), source=np.array([self._provenance]),
+            weight=parts.weight[None], mean=wrap(parts.mean[None], self.layout.periods), cov=parts.cov[None],
+            dof=np.array([state.dof]), time_ns=np.array([time_ns]), status=np.array([status], np.uint8),
+            source=np.array([self._provenance]),
         )  # fmt: skip
 
     @property
@@ -229,7 +231,7 @@ class SensorTracker:
         if len(fused) > 1:
             own_mean, own_cov = self._state.moments
             mean, cov = fused.moments
-            at = int(np.argmin(mahalanobis_squared(mean - own_mean, cov + own_cov)))
+            at = int(np.argmin(mahalanobis_squared(difference(mean, own_mean, self.layout.periods), cov + own_cov)))
         self._provenance |= fused.source[at]
         self._state = self.filter.adopt(self._state, _density(fused[at : at + 1]))
         return True
@@ -238,7 +240,7 @@ class SensorTracker:
 def _density(track: TrackBatch) -> Density:
     """Return a track as its particles if it consists of them, else as its merged Gaussian."""
     if track.components > 1 and not track.cov.any():
-        return Particles(track.mean[0], log_of(track.weight[0]))
+        return Particles(track.mean[0], log_of(track.weight[0]), periods=track.layout.periods)
     (mean,), (cov,) = track.moments
     return Gaussian(mean, cov)
 

@@ -31,7 +31,9 @@ def test_errors_right_after_the_fusions_are_those_of_the_errata(outcomes):
     centre, igs = (found[f"{row}/median_position_error_m"].value for row in (maneuver.CENTRE, maneuver.BY_IGS))
     assert centre <= igs
     order, *_ = judged_claims(maneuver.SCENARIO, found)
-    assert order["verdict"] == "agrees"
+    in_order = list(order["evidence"].values())
+    assert in_order == sorted(set(in_order))
+    assert order["verdict"] == "undecided"  # two runs prove nothing
 
 
 @pytest.mark.slow

@@ -69,7 +69,7 @@ def test_static_claims() -> None:
     found = {c["claim"]: c["verdict"] for c in judged_claims(static.SCENARIO, static.SCENARIO.measure(1, 0))}
     printed = [verdict for claim, verdict in found.items() if "as printed" in claim]
     others = [verdict for claim, verdict in found.items() if "as printed" not in claim]
-    assert printed == ["does not reproduce"] * 2
+    assert printed == ["contradicts"] * 2
     assert others == ["agrees"] * 4
 
 
@@ -297,7 +297,7 @@ def test_the_rule_behind_mhdp_is_the_one_of_the_printed_column() -> None:
 def test_advantage_of_mhdp_in_case_1_does_not_reproduce(errors: dict[str, Outcomes]) -> None:
     """ERRATA."""
     found = judged_claims(case_1.SCENARIO, dynamic.figures(errors["I"]))
-    assert [claim["verdict"] for claim in found] == ["does not reproduce"] * 2 + ["agrees"]
+    assert [claim["verdict"] for claim in found] == ["contradicts"] * 2 + ["agrees"]
 
 
 @pytest.mark.slow

@@ -45,8 +45,7 @@ def measured():
 
 @pytest.fixture(scope="module")
 def unions():
-    wanted = (*ERRATA_UNION, "kf-covariance_union@max_trace", "kf-arithmetic_average", "kf-covariance_intersection")
-    return STUDY.figures(sampled({n: r for n, r in kalman_rows().items() if n in wanted}, range(UNION_RUNS), 21))
+    return STUDY.figures(sampled(kalman_rows(), range(UNION_RUNS), 21))
 
 
 @pytest.mark.parametrize("row", ERRATA)
@@ -70,7 +69,7 @@ def test_what_reproduces_and_what_does_not(measured):
     for row in ("kf-alone", "kf-ic", "kf-arithmetic_average"):
         assert found[f"{row}/position_armse_m"] == found[f"{row}/velocity_armse_mps"] == "agrees"
     assert found["kf-naive/velocity_armse_mps"] == "agrees"
-    assert found["kf-covariance_intersection/position_armse_m"] == "does not reproduce"
+    assert found["kf-covariance_intersection/position_armse_m"] == "contradicts"
     assert found["kf-covariance_intersection@uniform/position_armse_m"] == "not given"
 
 
@@ -81,7 +80,7 @@ def test_covariance_union_lies_where_the_errata_have_it_and_not_where_the_table_
         assert abs(found.value - value) <= 3 * error + 0.05, (row, found)  # 22.4 is given to .1
         assert found.value > unions["kf-arithmetic_average/position_armse_m"].value
     verdicts = {f["name"]: f["verdict"] for f in judged_figures(SCENARIO, unions)}
-    assert verdicts["kf-covariance_union/position_armse_m"] == "does not reproduce"
+    assert verdicts["kf-covariance_union/position_armse_m"] == "contradicts"
 
 
 def test_eq_8_as_printed_happens_to_be_the_bound_here(unions):
@@ -122,9 +121,11 @@ def test_credibility(measured, unions):
 
 
 def test_claims_come_out_as_the_errata_have_it(measured, unions):
-    judged = {c["claim"]: c["verdict"] for c in judged_claims(SCENARIO, measured | unions)}
+    judged = {c["claim"]: c["verdict"] for m in (unions, measured) for c in judged_claims(SCENARIO, m)}
     assert len(judged) == 19  # the particle filter's are not measured here
-    wrong = {claim for claim, verdict in judged.items() if verdict == "does not reproduce"}
+    # What is within 6 % by .02 and velocities that differ by 1 %: a thousand runs tell, forty would not.
+    assert not [claim for claim, verdict in judged.items() if verdict == "undecided"]
+    wrong = {claim for claim, verdict in judged.items() if verdict == "contradicts"}
     assert wrong == {
         "KF: average and intersection are similar (within 6 %)",
         "KF: the intersection is close to IC (within 6 %)",

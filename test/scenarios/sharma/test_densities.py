@@ -93,7 +93,7 @@ def test_least_alpha_gives_the_determinant_of_the_geometric_mean(measured):
 
 def test_claims_of_the_gaussians(measured):
     found = [c["verdict"] for c in judged_claims(sharma_gaussians.SCENARIO, measured["gaussians"])]
-    assert found == ["agrees", "agrees", "agrees", "does not reproduce", "agrees"]
+    assert found == ["agrees", "agrees", "agrees", "contradicts", "agrees"]
 
 
 def test_claims_of_the_mixtures(measured):

@@ -17,7 +17,7 @@ from track_fusion.scenarios.sharma import network_2 as sharma_network_2
 from track_fusion.scenarios.sharma.network import RULE_CHOICES, figures
 from track_fusion.study.rule_choice import RuleChoice
 
-RUNS = 4000
+RUNS = 12000
 MODULES = {"1": sharma_network_1, "2": sharma_network_2}
 #: Trace reported and trace of the errors' covariance at the sink.
 ERRATA = {
@@ -81,8 +81,9 @@ def test_consistency_of_the_errata(measured):
 
 def test_claims(measured):
     found = {k: [c["verdict"] for c in judged_claims(m.SCENARIO, measured[k])] for k, m in MODULES.items()}
-    assert found["1"] == ["agrees"] * 8 + ["does not reproduce", "agrees"]
-    assert found["2"] == ["agrees"] * 6 + ["does not reproduce"] * 2
+    # As (82) is printed CI returns the sink's own consistent estimate: its NEES / n is 1, not surely below.
+    assert found["1"] == ["agrees"] * 6 + ["undecided", "agrees", "contradicts", "agrees"]
+    assert found["2"] == ["agrees"] * 6 + ["contradicts"] * 2
 
 
 # ---- the mechanics against plain arithmetic -------------------------------------------------------------------------

@@ -71,7 +71,7 @@ def test_consistency_of_the_errata(outcomes):
 
 def test_claims(outcomes):
     found = [c["verdict"] for c in judged_claims(SCENARIO, figures(outcomes))]
-    assert found == ["agrees"] * 5 + ["does not reproduce"] * 4
+    assert found == ["agrees"] * 5 + ["contradicts"] * 4
 
 
 def test_pieces_equal_the_whole_and_only_chooses_rows(outcomes):

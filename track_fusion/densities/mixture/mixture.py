@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from track_fusion import angles
 from track_fusion.densities.log_domain import log_of, log_sum_exp
-from track_fusion.linalg import Array, cholesky, matvec, merged_moments, outer, symmetrise, transpose, whitener
+from track_fusion.linalg import Array, cholesky, matvec, outer, symmetrise, transpose, whitener
 
 LOG_2PI = float(np.log(2.0 * np.pi))
 #: Numbers in a temporary: larger ones leave the cache and, worse, are given back to the system each time.
@@ -69,10 +70,12 @@ def gaussian(mean: Array, cov: Array) -> Mixture:
     return Mixture(np.ones((*mean.shape[:-1], 1)), mean[..., None, :], cov[..., None, :, :])
 
 
-def moments(mixture: Mixture) -> tuple[Array, Array]:
-    """Mean (..., n) and covariance (..., n, n) of each mixture, its weights normalised first."""
-    part = mixture.normalised
-    return merged_moments(part.mean, part.cov, part.weight)
+def moments(mixture: Mixture, periods: Sequence[float] = ()) -> tuple[Array, Array]:
+    """Mean (..., n) and covariance (..., n, n) of each mixture, its weights normalised first.
+
+    `periods` (n,) are those of axes that wrap, see :mod:`track_fusion.angles`; empty: none does.
+    """
+    return angles.moments(mixture.weight, mixture.mean, mixture.cov, periods)
 
 
 def log_pdf(mixture: Mixture, points: Array) -> Array:

@@ -1,4 +1,7 @@
-"""Fewer components: greedy merging by Runnalls or Salmond, pruning, and keeping the heaviest."""
+"""Fewer components: greedy merging by Runnalls or Salmond, pruning, and keeping the heaviest.
+
+No axis wraps here: rules are given mixtures relative to a reference, filters hold theirs unrolled.
+"""
 
 from __future__ import annotations
 

@@ -54,9 +54,8 @@ def truths(runs: Sequence[int], seed: int, steps: int = STEPS) -> Array:
         rng = stream(seed, run, "truth")
         mode = int(rng.integers(MODES))
         for k in range(steps):
-            transition = TRANSITIONS[mode]
-            noise = transition.noise_factor @ rng.standard_normal(transition.noise_factor.shape[1])
-            row[k + 1] = transition.advance(row[k]) + noise
+            transition, factor = TRANSITIONS[mode], TRANSITIONS[mode].noise_factor(row[k])
+            row[k + 1] = transition.advance(row[k]) + factor @ rng.standard_normal(factor.shape[1])
             mode = int(np.searchsorted(np.cumsum(CHAIN[mode]), rng.random() * CHAIN[mode].sum(), side="right"))
     return states
 
@@ -111,7 +110,7 @@ def fuse_modes(choice: RuleChoice, seed: int) -> Fuse[MixtureModes]:
 
     def fuse(own: MixtureModes, heard: MixtureModes, common: MixtureModes | None, count: int) -> MixtureModes:
         extras = {"seed": np.random.default_rng([seed, count])} if "seed" in choice.rule.optional else {}
-        fused = choice.fuse(SourceTracks.of(stacked(own.mixture, heard.mixture), **extras))
+        fused = choice.fuse(SourceTracks.of(stacked(own.mixture, heard.mixture), (), **extras))
         log_eta = fused.info.get("log_eta", np.zeros(own.probability.shape))
         return MixtureModes(normalised(log_of(own.probability) + log_eta), fused.density)
 

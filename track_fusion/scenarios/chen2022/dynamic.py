@@ -23,10 +23,11 @@ from track_fusion.models.noise import Noise
 from track_fusion.rules import FusedTracks
 from track_fusion.scenarios.chen2022 import PAPER, choices
 from track_fusion.study.chart import Chart, Series
+from track_fusion.study.claim import Claim
 from track_fusion.study.one_target import drawn, fused_row, same_filters
 from track_fusion.study.rows import Outcomes, Progress, chosen
 from track_fusion.study.rule_choice import RuleChoice
-from track_fusion.study.scenario import Claim, Scenario
+from track_fusion.study.scenario import Scenario
 from track_fusion.study.scene import Tracking
 from track_fusion.tracks import StateLayout
 
@@ -86,8 +87,6 @@ TABLE_1_RULES = DCI, GP, FCI, KLA, QMMHD, MHDP_E, MHDP_I = tuple(choice.name for
 #: What the paper calls those that are compared with MHDP.
 SHORT = {DCI: "DCI", GP: "GP", FCI: "FCI", KLA: "KLA", QMMHD: "QMMHD"}
 FIGURE, EXCESS = "position_armse_m", "position_excess_m"
-#: One rule is better than another when the difference exceeds this many standard errors.
-CLEAR = 3.0
 
 ASSUMPTIONS = (
     "the truth starts at a draw from N(x(0|0), P(0|0))",
@@ -183,22 +182,18 @@ def claims(name: str, printed: Mapping[str, float]) -> list[Claim]:
     def needs(*rules: str) -> tuple[str, ...]:
         return tuple(f"{name}-{rule}/{FIGURE}" for rule in rules)
 
-    def clear(*excesses: Estimate) -> bool:
-        return all(e.value > CLEAR * e.standard_error for e in excesses)
-
     others = (DCI, GP, FCI, KLA, QMMHD)
     second, *rest = sorted(others[1:], key=printed.__getitem__)
     statements = [
-        Claim(f"{label}: MHDP-E has clearly lower errors than DCI, GP, FCI, KLA and QMMHD", "5.2, Fig. 3, Table 1",
-              tuple(f"{name}-{rule}/{EXCESS}" for rule in others), clear),
+        Claim.above(f"{label}: MHDP-E has clearly lower errors than DCI, GP, FCI, KLA and QMMHD",
+                    "5.2, Fig. 3, Table 1", 0.0, *(f"{name}-{rule}/{EXCESS}" for rule in others)),
         Claim.least(f"{label}: {SHORT[second]} comes next, before {', '.join(SHORT[rule] for rule in rest)}",
                     "Table 1", needs(second)[0], needs(*rest)),
         Claim.greatest(f"{label}: DCI is the worst", "5.2", needs(DCI)[0], needs(*TABLE_1_RULES[1:])),
     ]  # fmt: skip
     if name == "gstm":
         text = f"{label}: MHDP-I is slightly, but clearly better than MHDP-E"
-        names = (f"{name}-{MHDP_I}/{EXCESS}",)
-        statements.append(Claim(text, "5.2", names, lambda e: e.value < -CLEAR * e.standard_error))
+        statements.append(Claim.below(text, "5.2", 0.0, f"{name}-{MHDP_I}/{EXCESS}"))
     return statements
 
 

@@ -16,9 +16,10 @@ from track_fusion.rules.geometric_average import GeometricAverageParams
 from track_fusion.scenarios.li2019 import PAPER
 from track_fusion.scenarios.li2019.averages import density_average, density_moments
 from track_fusion.study.chart import Chart, Contours, Series
+from track_fusion.study.claim import Claim, within
 from track_fusion.study.rows import Outcomes, Progress, exact_figures, exact_rows
 from track_fusion.study.rule_choice import RuleChoice
-from track_fusion.study.scenario import Claim, Scenario
+from track_fusion.study.scenario import Scenario
 
 #: Weights of the first density, the ends apart, and values of the parameter.
 WEIGHT = np.linspace(0.0, 1.0, 101)[1:-1]
@@ -236,7 +237,18 @@ def _appendix_chart() -> Chart:
 # Claims.
 
 #: Sums and products round.
-TIE = 1e-12
+TIE = 1e-9
+#: The variances of the sources in Figs. 5 and 6.
+LEAST_VARIANCES, GREATEST_VARIANCES = (100.0, 200.0), (200.0, 400.0)
+
+
+def _not_below(figure: Array, bound: float) -> Array:
+    """Margin of a figure that reaches its bound."""
+    return figure - (1.0 - TIE) * bound
+
+
+def _not_above(figure: Array, bound: float) -> Array:
+    return (1.0 + TIE) * bound - figure
 
 
 def _figures(quantity: str, average: str = AA) -> tuple[str, ...]:
@@ -248,69 +260,74 @@ CLAIMS = (
         "At the same weights the variance of the arithmetic average is greater than that of the geometric.",
         "Remark 5",
         _figures("least_excess_variance_1"),
-        lambda *e: all(x.value > 0 for x in e),
+        lambda *excesses: excesses,
     ),
     Claim(
         "The variance of the geometric average lies between those of its sources.",
         "Remark 5, (36)",
         (*_figures("least_variance_1", GA), *_figures("greatest_variance_1", GA)),
-        lambda a, b, c, d: a.value >= 100 and c.value <= 200 and b.value >= 200 and d.value <= 400,
+        lambda a, b, c, d: [
+            *(_not_below(low, least) for low, least in zip((a, b), LEAST_VARIANCES, strict=True)),
+            *(_not_above(high, most) for high, most in zip((c, d), GREATEST_VARIANCES, strict=True)),
+        ],
+        by_construction="a weighted harmonic mean lies between what it averages",
     ),
     Claim(
         "That of the arithmetic average may exceed both of its sources' (here means 50 and 80, variances 100 and 200).",
         "Remark 5",
         (f"{AA}@far/variance_ratio_1",),
-        lambda ratio: ratio.value > 1,
+        lambda ratio: [ratio - 1.0],
     ),
     Claim(
         "The mean square error of the arithmetic average lies between those of its sources.",
         "Remark 6",
         (*_figures("least_mse_ratio_1"), *_figures("greatest_mse_ratio_1")),
-        lambda a, b, c, d: min(a.value, b.value) >= 1 - TIE and max(c.value, d.value) <= 1 + TIE,
+        lambda a, b, c, d: [_not_below(a, 1.0), _not_below(b, 1.0), _not_above(c, 1.0), _not_above(d, 1.0)],
+        by_construction="a weighted mean lies between what it averages",
     ),
     Claim(
         "The mean square error of the geometric average is no less than the least variance of its sources.",
         "(42)",
         _figures("least_mse_1", GA),
-        lambda a, b: a.value >= 100 and b.value >= 200,
+        lambda *errors: [_not_below(e, least) for e, least in zip(errors, LEAST_VARIANCES, strict=True)],
     ),
     Claim(
         "Densities of the same variance, or both with the parameter as their mean: the mean square error of the "
         "geometric average is no greater than that of the arithmetic.",
         "Remark 7",
         (f"{AA}@same_variance/least_excess_mse_1", f"{AA}@same_mean/least_excess_mse_1"),
-        lambda *e: all(x.value >= 0 for x in e),
+        lambda *excesses: [excess + TIE for excess in excesses],
     ),
     Claim(
         "In most cases the mean square error of the arithmetic average is greater than that of the geometric.",
         "Remark 8",
         _figures("greater_mse_share_1"),
-        lambda *e: all(x.value > 0.5 for x in e),
+        lambda *shares: [share - 0.5 for share in shares],
     ),
     Claim(
         "It is smaller only where the parameter is well above both means and the density with the greater mean has the "
         "greater variance (in Fig. 5 above 60; never in Fig. 6).",
         "Remark 8",
         (f"{AA}@fig5/less_mse_from_theta_1", f"{AA}@fig6/greater_mse_share_1"),
-        lambda theta, share: theta.value > 60 and share.value == 1,
+        lambda theta, share: [theta - 60.0, _not_below(share, 1.0)],
     ),
     Claim(
         "For given densities and parameter one of the two averages has the smaller mean square error at all weights.",
         "Remark 8",
         _figures("crossed_theta_share_1"),
-        lambda *e: all(x.value == 0 for x in e),
+        lambda *shares: [TIE - share for share in shares],
     ),
     Claim(
         "The uniform density is an unbiased estimator on the interval (0, 1] that is printed.",
         "Appendix B",
         ("given-alone@appendix_uniform_to_1/mean_1",),
-        lambda mean: abs(mean.value - PARAMETER) < TIE,
+        lambda mean: within(mean - PARAMETER, TIE),
     ),
     Claim(
         "It is on (0, 4 sqrt(2)/3], and so are the other density and the arithmetic average.",
         "Appendix B, (30)",
         ("given-alone@appendix_uniform/mean_1", "given-alone@appendix_rising/mean_1", f"{AA}@appendix/mean_1"),
-        lambda *e: all(abs(x.value - PARAMETER) < TIE for x in e),
+        lambda *means: [margin for mean in means for margin in within(mean - PARAMETER, TIE)],
     ),
     Claim.order(
         "The geometric average of unbiased densities is biased.",

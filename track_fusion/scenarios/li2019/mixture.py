@@ -20,9 +20,10 @@ from track_fusion.scenarios.li2019.common import (
     scalar_mixture,
 )
 from track_fusion.study.chart import Chart, Series
+from track_fusion.study.claim import Claim, within
 from track_fusion.study.rows import Outcomes, Progress, exact_figures, exact_rows
 from track_fusion.study.rule_choice import RuleChoice
-from track_fusion.study.scenario import Claim, Scenario
+from track_fusion.study.scenario import Scenario
 
 #: GM 1 and GM 2, the second padded by a component of weight 0.
 PARTS = scalar_mixture(
@@ -150,7 +151,8 @@ CLAIMS = (
         "The weights of the geometric average sum to the average of the sources' sums.",
         "5.1",
         (f"{GA}/expected_targets_1", "given-alone@gm1/expected_targets_1", "given-alone@gm2/expected_targets_1"),
-        lambda fused, first, second: abs(fused.value - 0.5 * (first.value + second.value)) < 1e-6,
+        lambda fused, first, second: within(fused - 0.5 * (first + second), 1e-6),
+        by_construction="its weights are scaled to that sum",
     ),
     *(
         Claim.order(
@@ -184,13 +186,13 @@ CLAIMS = (
         "The isolated component survives in the arithmetic average, a peak of less weight.",
         "Remark 10",
         (f"{AA}/peaks_1", f"{AA}/component5_weight_1"),
-        lambda peaks, weight: peaks.value == 3 and 0 < weight.value < PARTS.weight[0, 2],
+        lambda peaks, weight: [*within(peaks - 3.0, 0.5), weight, PARTS.weight[0, 2] - weight],
     ),
     Claim(
         "It almost vanishes from the geometric average: no peak is left of it.",
         "Remark 10",
         (f"{GA}/peaks_1", f"{GA}/isolated_1", f"{AA}/isolated_1"),
-        lambda peaks, geometric, arithmetic: peaks.value == 2 and geometric.value < arithmetic.value,
+        lambda peaks, geometric, arithmetic: [*within(peaks - 2.0, 0.5), arithmetic - geometric],
     ),
 )
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from track_fusion.metrics.accuracy import Estimate
-from track_fusion.study.scenario import Claim
+from track_fusion.study.claim import Claim
 
 #: The rows of a table by their rules, and covariance union's as it is about the mean at which its bound is least.
 RULES = ("alone", "ic", "naive", "arithmetic_average", "covariance_intersection", "covariance_union")
@@ -38,16 +37,6 @@ def named(quantity: str, one: str, *rules: str) -> tuple[str, ...]:
     return tuple(f"{one}-{rule}/{quantity}" for rule in rules)
 
 
-def close(text: str, source: str, share: float, to: str, *others: str) -> Claim:
-    """Claim that figures lie within this share of another one."""
-
-    def holds(*estimates: Estimate) -> bool:
-        wanted, *values = (e.value for e in estimates)
-        return all(abs(value - wanted) <= share * wanted for value in values)
-
-    return Claim(text, source, (to, *others), holds)
-
-
 def union_claims(one: str, source: str) -> tuple[Claim, ...]:
     """Covariance union against the other rules, in both readings of its mean."""
     rest = named(POSITION, one, "alone", "ic", AVERAGE, INTERSECTION)
@@ -62,7 +51,7 @@ def union_claims(one: str, source: str) -> tuple[Claim, ...]:
                 f"{name} is over-conservative: credibility above 1, the arithmetic average's and the intersection's",
                 source,
                 named(CREDIBILITY, one, union, AVERAGE, INTERSECTION),
-                lambda first, *others: first.value > max(1.0, *(e.value for e in others)),
+                lambda first, *others: [first - 1.0, *(first - other for other in others)],
             ),
         ]
     return tuple(claims)
@@ -72,17 +61,17 @@ def balance_claims(one: str, source: str) -> tuple[Claim, ...]:
     """Naive fusion is overconfident; what the average and the intersection claim lies between it and the union."""
     name = one.upper()
     return (
-        Claim(
+        Claim.below(
             f"{name} with naive fusion is inconsistent: it claims less than a quarter of its mean squared error",
             source,
-            named(CREDIBILITY, one, "naive"),
-            lambda e: e.value < 0.25,
+            0.25,
+            *named(CREDIBILITY, one, "naive"),
         ),
-        Claim(
+        Claim.above(
             f"{name} with the arithmetic average or the intersection is conservative (credibility above .95)",
             source,
-            named(CREDIBILITY, one, AVERAGE, INTERSECTION),
-            lambda *all_: all(e.value > 0.95 for e in all_),
+            0.95,
+            *named(CREDIBILITY, one, AVERAGE, INTERSECTION),
         ),
         Claim.order(
             f"{name}: chain (13) in what is claimed of the position, naive < sensor 1 < average < union",
@@ -101,8 +90,11 @@ def weight_claims(one: str, source: str) -> tuple[Claim, ...]:
     """The average trusts the better sensor more, much the same in every run."""
     names = named(WEIGHT, one, AVERAGE), named("sensor_1_weight_sd_1", one, AVERAGE)
     return (
-        Claim(f"{one.upper()}: the average gives sensor 1, the better one, more weight", source, names[0],
-              lambda e: e.value > 0.5),
-        Claim(f"{one.upper()}: that weight varies little (standard deviation over runs below .05)", source, names[1],
-              lambda e: e.value < 0.05),
-    )  # fmt: skip
+        Claim.above(f"{one.upper()}: the average gives sensor 1, the better one, more weight", source, 0.5, *names[0]),
+        Claim.below(
+            f"{one.upper()}: that weight varies little (standard deviation over runs below .05)",
+            source,
+            0.05,
+            *names[1],
+        ),
+    )

@@ -17,7 +17,6 @@ from track_fusion.scenarios.li2022.claims import (
     POSITION,
     VELOCITY,
     balance_claims,
-    close,
     named,
     union_claims,
     weight_claims,
@@ -25,10 +24,11 @@ from track_fusion.scenarios.li2022.claims import (
 from track_fusion.scenarios.li2022.claims import (
     RULES as ROWS,
 )
+from track_fusion.study.claim import Claim, ascending
 from track_fusion.study.one_target import RULE_CHOICES, Row, alone_row, fused_row, same_filters, sir_rows
 from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
 from track_fusion.study.rule_choice import RuleChoice
-from track_fusion.study.scenario import Claim, Printed, Scenario
+from track_fusion.study.scenario import Printed, Scenario
 from track_fusion.study.scene import Tracking
 from track_fusion.tracks import planar_layout
 
@@ -102,13 +102,14 @@ def _claims() -> tuple[Claim, ...]:
             "IV-A",
             named(POSITION, "kf", *ROWS),
             named(POSITION, "sir", *ROWS),
-            float.__lt__,
+            ascending,
         ),
-        Claim(
+        Claim.near(
             "KF-IC is Bayes-optimal: what it claims is its mean squared error (credibility within 5 % of 1)",
             "IV",
-            named(CREDIBILITY, "kf", "ic"),
-            lambda e: abs(e.value - 1.0) < 0.05,
+            1.0,
+            0.05,
+            *named(CREDIBILITY, "kf", "ic"),
         ),
     ]
     for one in ("kf", "sir"):
@@ -121,9 +122,11 @@ def _claims() -> tuple[Claim, ...]:
                 f"{one}-naive/{POSITION}",
                 named(POSITION, one, *_OTHERS),
             ),
-            close(f"{name}: average and intersection are similar (within 6 %)", "IV-A", CLOSE, average, intersection),
-            close(f"{name}: the average is close to IC (within 6 %)", "IV-A", CLOSE, ic, average),
-            close(f"{name}: the intersection is close to IC (within 6 %)", "IV-A", CLOSE, ic, intersection),
+            Claim.close(
+                f"{name}: average and intersection are similar (within 6 %)", "IV-A", CLOSE, average, intersection
+            ),
+            Claim.close(f"{name}: the average is close to IC (within 6 %)", "IV-A", CLOSE, ic, average),
+            Claim.close(f"{name}: the intersection is close to IC (within 6 %)", "IV-A", CLOSE, ic, intersection),
             Claim.order(f"{name}: the average beats the intersection in position", "Table I", average, intersection),
             Claim.order(
                 f"{name}: the intersection beats the average in velocity",

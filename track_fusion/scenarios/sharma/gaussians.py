@@ -19,9 +19,10 @@ from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import densities as shared
 from track_fusion.scenarios.sharma.densities import COVS, GMD_S, HALF, HMD_GA, HMD_S, SAMPLES, Pair, Row
 from track_fusion.study.chart import Chart, Series, bars, ellipse, estimates
+from track_fusion.study.claim import Claim
 from track_fusion.study.rows import Outcomes, Progress
 from track_fusion.study.rule_choice import RuleChoice
-from track_fusion.study.scenario import Claim, Scenario
+from track_fusion.study.scenario import Scenario
 
 #: (75)-(76).
 MEANS = np.array([[0.5, 1.0], [2.0, 1.0]])

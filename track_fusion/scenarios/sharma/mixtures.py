@@ -16,9 +16,10 @@ from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import densities as shared
 from track_fusion.scenarios.sharma.densities import COVS, GMD_S, HALF, HMD_GA, HMD_S, Pair
 from track_fusion.study.chart import Chart, Contours
+from track_fusion.study.claim import Claim
 from track_fusion.study.rows import Outcomes, Progress
 from track_fusion.study.rule_choice import RuleChoice
-from track_fusion.study.scenario import Claim, Scenario
+from track_fusion.study.scenario import Scenario
 
 #: The two mixtures after (76); the second is printed as another p^1.
 PAIR = Pair(

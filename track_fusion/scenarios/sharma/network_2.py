@@ -11,7 +11,6 @@ from track_fusion.filters.base import Gaussian
 from track_fusion.filters.iterated_corrector import IteratedCorrector
 from track_fusion.filters.kalman import Kalman
 from track_fusion.linalg import Array, matvec
-from track_fusion.metrics.accuracy import Estimate
 from track_fusion.models.base import Transition
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.random_streams import stream
@@ -19,8 +18,9 @@ from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import network as shared
 from track_fusion.scenarios.sharma.network import RULE_CHOICES, Local, Network, common_claims
 from track_fusion.study.chart import Chart
+from track_fusion.study.claim import Claim
 from track_fusion.study.rows import Outcomes, Progress
-from track_fusion.study.scenario import Claim, Scenario
+from track_fusion.study.scenario import Scenario
 from track_fusion.trackers.fusion_loop import filtered
 
 STEPS, NODES = 5, 5
@@ -66,8 +66,8 @@ def charts(outcomes: Outcomes) -> list[Chart]:
     return shared.charts({"": "S5"}, outcomes)
 
 
-def _almost(central: Estimate, harmonic: Estimate) -> bool:
-    return harmonic.value <= ALMOST * central.value
+def _almost(central: Array, harmonic: Array) -> list[Array]:
+    return [ALMOST * central - harmonic]
 
 
 SCENARIO = Scenario(

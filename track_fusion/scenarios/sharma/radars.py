@@ -28,9 +28,10 @@ from track_fusion.scenarios.sharma.radar_runs import (
     tracked,
 )
 from track_fusion.study.chart import Chart, Series
+from track_fusion.study.claim import Claim
 from track_fusion.study.rows import Outcomes, Progress, chosen
 from track_fusion.study.rule_choice import RuleChoice
-from track_fusion.study.scenario import Claim, Scenario
+from track_fusion.study.scenario import Scenario
 
 #: Fusions from this time on count: before it tracks are still starting.
 SETTLED_S = 60.0
@@ -198,9 +199,8 @@ def _needs(quantity: str, *rows: str) -> tuple[str, ...]:
     return tuple(f"pda-{row}/{quantity}" for row in rows)
 
 
-def _close(first: Estimate, *others: Estimate) -> bool:
-    """Tell whether figures lie within a tenth of the first."""
-    return all(abs(other.value - first.value) <= 0.1 * first.value for other in others)
+#: How near figures lie that show no difference, as a share.
+CLOSE = 0.1
 
 
 CLAIMS = (
@@ -209,18 +209,18 @@ CLAIMS = (
                     *_needs(f"category_{c}_nees_1", CI, rule))
         for c in "ab" for title, rule in (("ICI", ICI), ("HMD-GA", HMD))
     ),
-    Claim("Category A: the NEES of ICI and HMD-GA show no difference (a tenth at most).", "6.4.3",
-          _needs("category_a_nees_1", ICI, HMD), _close),
-    Claim("Category C: CI is no more conservative than ICI and HMD-GA (NEES within a tenth).", "6.4.3",
-          _needs("category_c_nees_1", CI, ICI, HMD), _close),
+    Claim.close("Category A: the NEES of ICI and HMD-GA show no difference (a tenth at most).", "6.4.3", CLOSE,
+                *_needs("category_a_nees_1", ICI, HMD)),
+    Claim.close("Category C: CI is no more conservative than ICI and HMD-GA (NEES within a tenth).", "6.4.3", CLOSE,
+                *_needs("category_c_nees_1", CI, ICI, HMD)),
     *(
         Claim.order(f"The NEES of {title} is lower in category B than in A.", "6.4.3",
                     f"pda-{rule}/category_b_nees_1", f"pda-{rule}/category_a_nees_1")
         for title, rule in (("CI", CI), ("ICI", ICI), ("HMD-GA", HMD))
     ),
     *(
-        Claim(f"Category {c.upper()}: HMD-GA is conservative (NEES at most 4).", "6.4.3, 7",
-              _needs(f"category_{c}_nees_1", HMD), lambda e: not e.exceeds(4.0))
+        Claim.below(f"Category {c.upper()}: HMD-GA is conservative (NEES at most 4).", "6.4.3, 7", 4.0,
+                    *_needs(f"category_{c}_nees_1", HMD))
         for c in CATEGORIES
     ),
     *(
@@ -228,21 +228,21 @@ CLAIMS = (
                     *_needs(f"category_{c}_claimed_m", HMD, ICI))
         for c in CATEGORIES
     ),
-    Claim("Category A: HMD-GA has the least error of the three most of the time.", "6.4.3",
-          _needs("category_a_least_1", HMD), lambda e: e.value > 0.5),
+    Claim.above("Category A: HMD-GA has the least error of the three most of the time.", "6.4.3", 0.5,
+                *_needs("category_a_least_1", HMD)),
     *(
         Claim.order(f"Category {c.upper()}: HMD-GA has a smaller error than {title}.", "7",
                     *_needs(f"category_{c}_rmse_m", HMD, rule))
         for c in CATEGORIES for title, rule in (("CI", CI), ("ICI", ICI))
     ),
-    Claim("Category A: the error of CI is close to that of ICI (within a tenth).", "6.4.3",
-          _needs("category_a_rmse_m", ICI, CI), _close),
+    Claim.close("Category A: the error of CI is close to that of ICI (within a tenth).", "6.4.3", CLOSE,
+                *_needs("category_a_rmse_m", ICI, CI)),
     Claim.order("HMD-GA: the error is least in category A and largest in C.", "6.4.3",
                 *(f"pda-{HMD}/category_{c}_rmse_m" for c in "abc")),
     Claim.order("HMD-GA: of category A target 10 has the least error and target 4 the largest.", "6.4.3",
                 *(f"pda-{HMD}/target_{number}_rmse_m" for number in (10, 15, 4))),
-    Claim("Category C: the error is that of the radar alone (within a tenth).", "6.4.3",
-          _needs("category_c_rmse_m", "alone", CI, ICI, HMD), _close),
+    Claim.close("Category C: the error is that of the radar alone (within a tenth).", "6.4.3", CLOSE,
+                *_needs("category_c_rmse_m", "alone", CI, ICI, HMD)),
 )  # fmt: skip
 
 SCENARIO = Scenario(

@@ -8,8 +8,9 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from track_fusion.angles import TURN, wrap
 from track_fusion.linalg import Array
-from track_fusion.models.measurement import RangeBearingSensor, wrap_angle
+from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.random_streams import stream
 from track_fusion.tracks import StateLayout
 
@@ -85,7 +86,7 @@ class Radar:
             detected = self.sees(states) & (rng.random(len(states)) < self.detection_probability)
             values = (self.sensor.observe(states) + sd * rng.standard_normal((len(states), 2)))[detected]
             false = rng.uniform([0.0, -np.pi], [self.reach_m, np.pi], (rng.poisson(self.clutter_mean), 2))
-            values[:, 1] = wrap_angle(values[:, 1])
+            values[:, 1] = wrap(values[:, 1], TURN)
             yield rng.permutation(np.concatenate([values, false]))
 
 

@@ -1,0 +1,72 @@
+"""What the README says of the published studies is what the claims and figures come to."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from track_fusion.scenarios import SCENARIOS, judged_claims, judged_figures
+
+README = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+STATEMENTS = re.sub(r"\s+", " ", README.partition("## Published studies, repeated")[2].partition("## More")[0])
+
+#: Words of the README -> scenario, rows to run, runs (0: the scenario's own), claims by their beginnings -> verdict.
+SAID = {
+    "Covariance intersection with trace-optimal weights and common feedback always puts all weight on sensor 1": (
+        "li2022-linear", ("kf-alone", "kf-ic", "kf-arithmetic_average", "kf-covariance_intersection"), 300,
+        {"KF: the intersection is close to IC": "contradicts", "KF: the average is close to IC": "agrees"},
+    ),
+    "the criterion as printed collapses onto one estimate (`criterion: squared` does not)": (
+        "chen2022-static", ("",), 0,
+        {
+            "t densities: MHDP-E, by the distances as printed": "contradicts",
+            "generalised Gaussians: MHDP-E, by the distances as printed": "contradicts",
+            "t densities: MHDP-E, by squared distances": "agrees",
+            "generalised Gaussians: MHDP-E, by squared distances": "agrees",
+        },
+    ),
+    "that the least variance of the arithmetic average is never above that of the geometric, whatever the two "
+    "variables, is not so (two lognormals contradict it)": (
+        "li2019-variables", ("",), 100,
+        {
+            "In Figs. 1 and 2 the least variance of the arithmetic average": "agrees",
+            "So it is for any two variables": "contradicts",
+        },
+    ),
+    "the harmonic mean density claims less than inverse covariance intersection and errs less, as claimed": (
+        "sharma-network-2", ("",), 4000,
+        {"HMD-GA reports the least": "agrees", "The actual error of HMD-GA is less than ICI's": "agrees"},
+    ),
+    "that it is always consistent, or always tighter, is not so": (
+        "sharma-scalar", ("given-harmonic_mean", "kf-harmonic_mean"), 200,
+        {"HMD-GA is consistent: variances 1 and 10": "contradicts", "HMD-GA is consistent: in this": "contradicts"},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("words", SAID)
+def test_claims_come_out_as_the_readme_says(words: str) -> None:
+    assert words in STATEMENTS
+    key, rows, runs, wanted = SAID[words]
+    scenario, measured = SCENARIOS[key], {}
+    for only in rows:
+        measured |= scenario.measure(runs or scenario.default_runs, 0, only=only)
+    judged = {c["claim"]: c["verdict"] for c in judged_claims(scenario, measured)}
+    for start, verdict in wanted.items():
+        assert {v for claim, v in judged.items() if claim.startswith(start)} == {verdict}, start
+
+
+def test_figures_come_out_as_the_readme_says() -> None:
+    """Sensor 1 alone, the iterated corrector, the average and its weights; not the intersection, which is sensor 1."""
+    assert "sensor 1 alone, the iterated corrector, the arithmetic average and its weights agree" in STATEMENTS
+    scenario, measured = SCENARIOS["li2022-linear"], {}
+    for only in ("kf-alone", "kf-ic", "kf-arithmetic_average", "kf-covariance_intersection"):
+        measured |= scenario.measure(200, 0, only=only)
+    verdicts = {f["name"]: f["verdict"] for f in judged_figures(scenario, measured) if f["published"] is not None}
+    for name, verdict in verdicts.items():
+        if name == "kf-covariance_intersection/position_armse_m":
+            assert verdict == "contradicts"
+        elif not name.startswith("kf-covariance_intersection"):
+            assert verdict == "agrees", name
