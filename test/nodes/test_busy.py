@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nodes.test_scenarios_over_ros import RADAR_STEPS, RADARS, RUN, SEED, Case, run
+from nodes.scenario_runs import RADAR_STEPS, RADARS, RUN, SEED, Case, run
 
 from track_fusion.scenarios.sharma import radar_runs
 from track_fusion.study.one_target import Row

@@ -7,19 +7,16 @@ depends on the feedback.
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
-from nodes.support import START_S, STEP_S, read, stamp_ns
+from nodes.scenario_runs import RADAR_STEPS, RADARS, RUN, SEED, Case, run
+from nodes.support import read, stamp_ns
 from numpy.typing import NDArray
-from ros_helpers import Probe
-from sensor_msgs.msg import PointCloud2
 
-from track_fusion.demo.bringup import local_environment, running, start_scenario
 from track_fusion.demo.wiring import Bringup, bringups
 from track_fusion.rules import RULES, get_rule
 from track_fusion.scenarios import RuleChoice, get_scenario
@@ -30,23 +27,7 @@ from track_fusion.scenarios.sharma import radar_runs as sharma_radar_runs
 from track_fusion.study.one_target import Row, alone_row, drawn, fused_row, sir_filters
 from track_fusion.tracks import TrackBatch
 
-SEED, RUN = 5, 2
-RUN_S = 300.0  # a run takes 5 s on two idle cores; tests of others may be running
 TOLERANCE = 1e-9
-
-
-class Case(NamedTuple):
-    """A run over ROS: parameter file, rule (None: the first sensor alone), beginning of the scenario's row."""
-
-    name: str
-    rule: str | None
-    row: str
-    library: Row
-    parameters: dict[str, Any] = {}
-    steps: int = 0  # 0: all
-
-    def __str__(self) -> str:
-        return f"{self.name}:{self.rule or 'alone'}"
 
 
 def choice(name: str, rule: str) -> RuleChoice:
@@ -90,43 +71,11 @@ def chen2022() -> Iterator[Case]:
 CASES = [*li2022(), *chen2022()]
 #: One of each family of densities; the others are slow by their number.
 QUICK = {"li2022-nonlinear:arithmetic_average", "li2022-nonlinear-sir:alone", "chen2022-dynamic-1:mhdp_iterative"}
-RADARS, RADAR_STEPS = "sharma-radars", 40
 
 
 def test_every_parameter_file_is_run() -> None:
     tested_elsewhere = {"li2022-linear"}  # test_lockstep.py
     assert {c.name for c in CASES} | tested_elsewhere | {RADARS} == set(bringups())
-
-
-def run(case: Case, context: Any, domain: int, folder: Path) -> tuple[list[PointCloud2], dict[str, Any]]:
-    """Run all steps of a scenario; return the fused tables and what the evaluator says."""
-    log, judged = folder / "nodes.log", folder / "judged.json"
-    bringup, fused = Bringup(case.name), "/fusion_centre/tracks" if case.rule else "/sensor_1/tracks"
-    trackers = bringup.trackers if case.rule else bringup.trackers[:1]
-    patient = {"subscribers_deadline_s": START_S}
-    overrides: dict[str, dict[str, Any]] = {name: {**patient, "feedback_timeout_s": RUN_S} for name in trackers}
-    overrides["fusion_centre"] = {**patient, **case.parameters}
-    overrides["replay"] = {"seed": SEED, "run": RUN, "deadline_s": START_S}
-    overrides["evaluator"] = {"output": str(judged)}
-    publisher = "fusion_centre" if case.rule else trackers[0]
-    readers = bringup.sections["fusion_centre"]["expected_subscribers"] if case.rule else 2
-    overrides[publisher]["expected_subscribers"] = readers + 1  # this test
-    steps = case.steps or get_scenario(bringup.scenario).played().steps
-    results = steps // bringup.result_every
-    overrides["replay"]["steps"], overrides["evaluator"]["steps"] = steps, results
-    messages: list[PointCloud2] = []
-    with Probe(context) as probe, running(local_environment(domain), log) as nodes:
-        messages = probe.listen(fused, PointCloud2, 1000)
-        start_scenario(nodes, case.name, case.rule, overrides)
-
-        def done() -> bool:
-            assert nodes.failed() is None, f"{nodes.failed()} failed: {log.read_text()}"
-            return len(messages) >= results
-
-        probe.wait_for(done, RUN_S, "all steps")
-        for name in ("replay", "evaluator"):
-            assert nodes.processes[name].wait(STEP_S) == 0, log.read_text()
-    return messages, json.loads(judged.read_text())
 
 
 @pytest.mark.parametrize(

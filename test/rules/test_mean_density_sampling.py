@@ -10,6 +10,7 @@ import pytest
 from densities.mixture.examples import draw
 from rules.mixtures import as_tracks
 
+from track_fusion.densities.harmonic import HarmonicMean
 from track_fusion.densities.mixture.mean_density import log_mean_density, sample_mean_density
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.densities.on_grid import grid, moments_on_grid
@@ -145,3 +146,113 @@ def test_the_harmonic_mean_says_when_it_draws() -> None:
     sampler = get_rule("geometric_mean_sampling")
     assert sampler.uses("seed", sampler.params())
     assert not sampler.uses("common", sampler.params())
+
+
+# Three sources at once.
+
+THREE = {"criterion": "given", "weights": (0.5, 0.2, 0.3), "samples": SAMPLES}
+TRIPLE = SourceTracks(
+    np.array([[0.5, 1.0], [2.0, 1.0], [-0.5, 0.0]]), np.stack([A, B, np.array([[1.5, 0.5], [0.5, 1.0]])])
+)
+
+
+def _three_mixtures() -> SourceTracks:
+    assert MIXTURES.mixture is not None
+    third = draw(np.random.default_rng(3), 1, count=2)
+    parts = (np.concatenate(pair) for pair in zip(vars(MIXTURES.mixture).values(), vars(third).values(), strict=True))
+    return as_tracks(Mixture(*parts))
+
+
+@pytest.mark.parametrize("kind", ["gaussians", "mixtures"])
+def test_the_harmonic_mean_of_three_is_the_density_itself(kind: str) -> None:
+    """1 / sum of w_i / p_i on a grid; folded, it is another."""
+    tracks = TRIPLE if kind == "gaussians" else _three_mixtures()
+    part = tracks.mixture or Mixture(np.ones((3, 1)), tracks.mean[:, None], tracks.cov[:, None])
+    log_mean = log_mean_density(log_pdf(part, GRID[None]), np.array(THREE["weights"]), "harmonic")
+    wanted_mean, wanted_cov = moments_on_grid(log_mean, GRID)
+    sigma = np.sqrt(np.diag(wanted_cov))
+
+    def apart(fused: FusedTracks) -> tuple[float, float]:
+        unit = np.outer(sigma, sigma)
+        return float(np.abs((fused.mean - wanted_mean) / sigma).max()), float(
+            np.abs((fused.cov - wanted_cov) / unit).max()
+        )
+
+    joint, folded = run("harmonic_mean", tracks, **THREE), run("harmonic_mean", tracks, **THREE, combine="fold")
+    error = 4.0 / np.sqrt(float(joint.info["ess"]) * SAMPLES)
+    assert apart(joint)[0] <= error
+    assert apart(joint)[1] <= 2 * error
+    assert max(apart(folded)) > 2 * error
+    assert joint.info["converged"]
+
+
+@pytest.mark.parametrize("criterion", ["det", "trace", "given"])
+def test_one_gaussian_for_the_denominator_of_three(criterion: str) -> None:
+    """The closed form is that of densities/harmonic.py; the weights that are told are those of the mean, omega."""
+    rule, given = get_rule("harmonic_mean"), THREE["weights"] if criterion == "given" else ()
+    fused = rule(TRIPLE, from_dict(rule.params, {"criterion": criterion, "weights": given}))
+    harmonic = HarmonicMean.of(TRIPLE.mean[None], TRIPLE.cov[None])
+    assert fused.weights is not None
+    assert fused.weights.sum() == pytest.approx(1.0)
+    mean, cov = harmonic.at(harmonic.shares(fused.weights[None]))
+    np.testing.assert_allclose(fused.mean, mean[0], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(fused.cov, cov[0], rtol=1e-9)
+    if criterion == "given":
+        np.testing.assert_allclose(fused.weights, given, rtol=1e-12)
+
+
+def test_for_two_joint_and_fold_are_the_same() -> None:
+    for values in ({}, {"criterion": "trace"}, {"method": "sampling", "samples": 500}):
+        rule = get_rule("harmonic_mean")
+        joint, fold = (rule(GAUSSIANS, from_dict(rule.params, {**values, "combine": c})) for c in ("joint", "fold"))
+        np.testing.assert_array_equal(joint.mean, fold.mean)
+        np.testing.assert_array_equal(joint.cov, fold.cov)
+
+
+# Samples that tell nothing.
+
+
+@pytest.mark.parametrize("apart", [8.0, 1e4])
+@pytest.mark.parametrize("places", [(0.0, 1.0), (0.0, 1.0, 6.0)])
+def test_where_next_to_no_sample_counts_the_closed_form_takes_their_place(
+    apart: float, places: tuple[float, ...]
+) -> None:
+    """Unit tracks so far apart: 28 of 5000 samples counted, or one, which claimed a variance of 1e-106."""
+    count = len(places)
+    tracks = SourceTracks(apart * np.array(places)[:, None] * [1.0, 0.0], np.tile(np.eye(2), (count, 1, 1)))
+    closed = {"geometric_mean_sampling": "geometric_average", "harmonic_mean": "harmonic_mean"}
+    for key in closed if apart > 8.0 else ["geometric_mean_sampling"]:
+        fused, wanted = run(key, tracks), get_rule(closed[key])(tracks)
+        assert fused.info["ess"] <= 0.01
+        assert not fused.info["converged"]
+        np.testing.assert_allclose(fused.mean, wanted.mean, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(fused.cov, wanted.cov, rtol=1e-9, atol=1e-12)
+        if apart > 8.0:
+            np.testing.assert_allclose(run(key, tracks, inflation=2.0).cov, 2.0 * wanted.cov, rtol=1e-9, atol=1e-12)
+
+
+def test_mixtures_fall_back_on_powers_of_components_and_on_moments() -> None:
+    assert MIXTURES.mixture is not None
+    far = dataclasses.replace(MIXTURES.mixture, mean=MIXTURES.mixture.mean + np.array([[[0.0, 0.0]], [[1e3, 0.0]]]))
+    tracks = as_tracks(far)
+    got = run("geometric_mean_sampling", tracks)
+    wanted = get_rule("mixture_geometric")(tracks)
+    assert not got.info["converged"]
+    np.testing.assert_allclose(got.cov, wanted.cov, rtol=1e-9)
+    assert got.mixture is not None
+    assert got.mixture.count == 4
+    got = run("harmonic_mean", tracks)
+    rule = get_rule("harmonic_mean")
+    wanted = rule(SourceTracks(tracks.mean, tracks.cov))
+    assert not got.info["converged"]
+    np.testing.assert_allclose(got.cov, wanted.cov, rtol=1e-9)
+
+
+def test_in_a_batch_only_those_that_fail_are_replaced() -> None:
+    far = GAUSSIANS.mean + np.array([[0.0, 0.0], [500.0, 0.0]])
+    both = SourceTracks(np.stack([GAUSSIANS.mean, far]), np.stack([GAUSSIANS.cov] * 2))
+    for key in ("geometric_mean_sampling", "harmonic_mean"):
+        fused = run(key, both)
+        np.testing.assert_array_equal(fused.info["converged"], [True, False])
+        np.testing.assert_allclose(fused.cov[0], run(key, GAUSSIANS).cov, rtol=1e-12)
+        np.testing.assert_array_equal(fused.info["ess"] > 0.01, [True, False])

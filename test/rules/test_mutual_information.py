@@ -254,7 +254,7 @@ def test_weights_of_a_fold_are_products_along_the_way(key: str) -> None:
     mean, cov = rng.normal(size=(6, 3, 4)), covariances(rng, 6, 3)
     first = fuse(key, mean[:, :2], cov[:, :2])
     then = fuse(key, np.stack([first.mean, mean[:, 2]], 1), np.stack([first.cov, cov[:, 2]], 1))
-    whole = fuse(key, mean, cov)
+    whole = fuse(key, mean, cov, **({"combine": "fold"} if key == HMD else {}))
     np.testing.assert_allclose(whole.cov, then.cov, rtol=1e-9)
     assert first.weights is not None
     assert then.weights is not None

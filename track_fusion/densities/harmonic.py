@@ -12,7 +12,7 @@ import dataclasses
 import numpy as np
 
 from track_fusion.densities.log_domain import log_of, normalised
-from track_fusion.linalg import Array, inverse, logdet, matvec, outer, solve, symmetrise, transpose
+from track_fusion.linalg import Array, inverse, keep_sole, logdet, matvec, outer, solve, symmetrise, transpose
 
 #: A weight that is not zero is no less than this, so that what it weighs is not forgotten.
 LEAST = float(np.finfo(float).tiny)
@@ -24,7 +24,8 @@ class HarmonicMean:
 
     Attributes
     ----------
-    origin, lower : (B, n), (B, n, n)     x = origin + L y
+    given : (B, K, n), (B, K, n, n)       the Gaussians
+    lower : (B, n, n)                     x = x_1 + L y
     naive : (B, n)                        a, the mean of the product of all
     inverse : (B, n, n)                   A^-1, its covariance
     others : (B, K, n, n)                 Q_i, the covariance of the product of all but i
@@ -33,7 +34,7 @@ class HarmonicMean:
     log_scale : (B, K)                    log c_i, up to what is common to all i
     """
 
-    origin: Array
+    given: tuple[Array, Array]
     lower: Array
     naive: Array
     inverse: Array
@@ -65,7 +66,7 @@ class HarmonicMean:
         gap = points[:, None] - naive[:, None, None] - means[:, :, None]  # x_j - m_i
         square = (gap * np.einsum("bjxy,bijy->bijx", info, gap)).sum(-1)
         log_scale = 0.5 * (logdet(others) + logdet(white) - (but_one * square).sum(-1))
-        return cls(mean[:, 0], lower, naive, total, others, means, drag, log_scale)
+        return cls((mean, cov), lower, naive, total, others, means, drag, log_scale)
 
     def shares(self, weights: Array) -> Array:
         """Weights of the mixture, (B, K), from those of the harmonic mean, (B, K) of sum 1."""
@@ -88,4 +89,6 @@ class HarmonicMean:
         root = solve(rest, self.inverse)  # N^-1 A^-1
         cov = self.lower @ symmetrise(self.inverse + self.inverse @ root) @ transpose(self.lower)
         shift = matvec(transpose(root), -centre)
-        return self.origin + matvec(self.lower, self.naive + shift), symmetrise(cov)
+        mean, cov = self.given[0][:, 0] + matvec(self.lower, self.naive + shift), symmetrise(cov)
+        keep_sole(mean, cov, *self.given, shares)
+        return mean, cov

@@ -59,9 +59,8 @@ def sampled_mean(
     ess = drawn.ess / params.samples
     lost = ess <= LEAST_EFFECTIVE
     if params.inflation == 1.0:
-        sole = weights == 1.0
-        alone = _all_same(parts) | sole.any(-1)
-        fused, lost = chosen(alone, _at(parts, sole.argmax(-1)), fused), lost & ~alone
+        alone = _all_same(parts) | ((weights > 0.0).sum(-1) == 1)
+        fused, lost = chosen(alone, _at(parts, weights.argmax(-1)), fused), lost & ~alone
     if lost.any():
         fused = chosen(lost, closed(), fused)
     return fused, {"converged": ~lost, "ess": ess, "log_eta": drawn.log_eta}

@@ -81,7 +81,7 @@ MANAGER = TrackManagerParams(confirmation_threshold=(2, 3), deletion_threshold=(
 RULE_CHOICES = (
     RuleChoice("covariance_intersection", CovarianceIntersectionParams()),
     RuleChoice("inverse_covariance_intersection", InverseCovarianceIntersectionParams()),
-    RuleChoice("harmonic_mean", HarmonicMeanParams()),
+    RuleChoice("harmonic_mean", HarmonicMeanParams(combine="fold")),
     RuleChoice("naive", NaiveParams()),
 )
 FUSION_TIMES_S: Array = SCAN_S * np.arange(FUSION_SCANS, STEPS + 1, FUSION_SCANS, dtype=np.float64)
