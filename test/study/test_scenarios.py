@@ -175,7 +175,7 @@ def test_the_margin_of_two_means_is_judged_as_their_differences_are():
     verdicts = {1: "agrees", -1: "contradicts", 0: "undecided"}
     seen = set()
     for shift in np.linspace(-1.5, 1.5, 61):
-        a, difference = rng.normal(size=20), rng.uniform(-1.7, 1.7, 10)
+        a, difference = rng.normal(size=40), rng.uniform(-1.7, 1.7, 20)
         difference = np.concatenate([difference, -difference]) + shift  # not skewed
         b = a + difference
         low, high = ttest_rel(b, a).confidence_interval(0.999)

@@ -66,7 +66,7 @@ def compare(name: str, rules: str, params: str, runs: int | None, seed: int, job
     count = (runs or scenario.default_runs) if scenario.random else 1
     (result,) = results([Study(name, find_scenario, count, seed, rules=specs)], jobs or os.cpu_count() or 1, None)
     groups = grouped(result.outcomes)
-    conservative = [c.name for c in chosen if c.rule.guarantee == "conservative"]
+    conservative = [c.name for c in chosen if c.rule.guarantee_at(c.params) == "conservative"]
     if as_json:
         output.print_json(_as_json(scenario, count, seed, groups, conservative))
     else:

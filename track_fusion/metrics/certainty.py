@@ -13,6 +13,8 @@ LEAST_RUNS = 10
 #: Skewness times R^-1/2 from which on the t interval cannot be trusted at such a TAIL: there the next term of the
 #: Edgeworth series is as large as TAIL itself.
 SKEWED = 0.1
+#: From so many runs on the skewness can be told; fewer are taken for skewed.
+TELLING = 30
 #: Share of the tail that skewed values may use: of ten runs of squared errors 5e-4 is wrong ten times as often.
 CAUTION = 0.1
 #: The signed ranks must lie so many standard deviations on the same side (99.5 %); ten of ten runs reach 2.8.
@@ -48,7 +50,7 @@ def surely_positive(values: Array, tail: float = TAIL) -> bool:
     t, limit = mean / np.sqrt(variance / runs), float(stdtrit(runs - 1, 1.0 - tail))
     third = float((deviation**3).sum()) * runs / ((runs - 1) * (runs - 2))
     skew = third / variance**1.5 / np.sqrt(runs)
-    if t <= limit or abs(skew) <= SKEWED:
+    if t <= limit or (abs(skew) <= SKEWED and runs >= TELLING):
         return bool(t > limit)
     straight = t + skew * t**2 / 3.0 + skew**2 * t**3 / 27.0 + skew / 6.0
     limit = float(stdtrit(runs - 1, 1.0 - CAUTION * tail))
