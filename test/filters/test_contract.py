@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import doctest
 import importlib
 import inspect
 import pkgutil
@@ -118,6 +119,11 @@ def run(value: Any, at: int) -> Any:
     if isinstance(value, list):
         return [run(v, at) for v in value]
     return value[one] if isinstance(value, np.ndarray) and value.shape[:1] == (RUNS,) else value
+
+
+def test_the_rooms_example_runs() -> None:
+    assert doctest.testmod(filters).attempted > 5
+    assert doctest.testmod(filters).failed == 0
 
 
 def test_no_filter_is_left_out() -> None:
