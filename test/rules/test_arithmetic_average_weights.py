@@ -52,7 +52,7 @@ def test_target_weights_against_slsqp(count: int) -> None:
         assert ours[i] >= found.fun - 1e-6
 
 
-# Target (33): the mixture itself ----------------------------------------------------------------------------------------
+# Target (33): the mixture itself --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 6])
