@@ -43,7 +43,7 @@ def value(cov: Array, criterion: str) -> float:
 @pytest.mark.parametrize("count", [2, 3, 5])
 @pytest.mark.parametrize("distance", [0.0, 1.0, 100.0])
 def test_it_bounds_every_track_and_touches(criterion: str, mean: str, count: int, distance: float) -> None:
-    """Lemma 1 of Li 2022: whichever track is right, the fused covariance covers it."""
+    """(7) of Li 2022: the fused covariance covers each track about the fused mean."""
     rng = np.random.default_rng(1)
     x, p = distance * rng.normal(size=(20, count, 4)), covariances(rng, 20, count)
     fused = fuse(x, p, criterion=criterion, mean=mean)
@@ -91,6 +91,54 @@ def test_bounds_as_printed_are_sides_of_largest_and_smallest_trace() -> None:
         np.testing.assert_allclose(fused.mean, centre, rtol=1e-12, atol=1e-14)
         np.testing.assert_allclose(np.trace(fused.cov, axis1=-2, axis2=-1), chosen, rtol=1e-12)
         assert (np.abs(sides - fused.cov[:, None]).max((2, 3)).min(1) < 1e-12).all()
+
+
+# What it promises -----------------------------------------------------------------------------------------------------
+
+
+def _ratio(errors: Array, cov: Array, **params: Any) -> float:
+    """Largest mean squared error over the mean claim, in any direction, of errors (S, K, n) that all happen."""
+    fused = fuse(errors, np.broadcast_to(cov, (*errors.shape[:2], *cov.shape[1:])), **params)
+    error, claim = np.einsum("si,sj->ij", fused.mean, fused.mean), fused.cov.sum(0)
+    return float(eigh(error, claim, eigvals_only=True)[-1])
+
+
+def test_one_track_alone_that_is_right_leaves_twice_the_claim() -> None:
+    """Track 1 exact, N(0, 1); track 2 claims 1 with three times track 1's error: 2; independent, sd 3: 2.5 / 3.5."""
+    z = np.linspace(-8.0, 8.0, 4001)
+    z = np.repeat(z, np.round(4000.0 * np.exp(-0.5 * z**2)).astype(int))
+    z /= np.sqrt(np.mean(z**2))
+    assert _ratio(np.stack([z, 3.0 * z], 1)[..., None], np.ones((2, 1, 1))) == pytest.approx(2.0)
+    first, second = (a.ravel() for a in np.meshgrid([-1.0, 1.0], [-3.0, 3.0]))
+    apart = _ratio(np.stack([first, second], 1)[..., None], np.ones((2, 1, 1)))
+    assert apart == pytest.approx(2.5 / 3.5)
+
+
+@CRITERIA
+@pytest.mark.parametrize("mean", ["arithmetic", "diversity", "optimal"])
+def test_twice_the_claim_is_the_most_when_one_track_is_right(mean: str, criterion: str) -> None:
+    """P >= P_1 + d d', the error is that of track 1 plus d, and (a + b)(a + b)' <= 2 a a' + 2 b b': about any mean."""
+    rng = np.random.default_rng(11)
+    worst = 0.0
+    for _ in range(12):
+        count = int(rng.integers(2, 4))
+        cov = covariances(rng, count, n=2)
+        size = 10.0 ** rng.uniform(-1.0, 1.0, size=(count - 1, 1, 1))
+        mix = size * rng.normal(size=(count - 1, 2, 2))
+        right = rng.normal(size=(60, 2))
+        right = right @ np.linalg.inv(np.linalg.cholesky(right.T @ right / 60)).T @ np.linalg.cholesky(cov[0]).T
+        rest = np.einsum("kij,sj->ski", mix, right) + 0.2 * rng.uniform() * rng.normal(size=(60, count - 1, 2))
+        errors = np.concatenate([right[:, None], rest], 1)
+        worst = max(worst, _ratio(errors, cov, criterion=criterion, mean=mean))
+    assert 1.2 < worst <= 2.0 + 1e-9
+
+
+def test_the_descriptor_says_so() -> None:
+    assert RULE.guarantee_at() == "conservative"
+    assert "twice" in RULE.caveat
+    assert "twice" in (RULE.fuse.__doc__ or "")
+    for values in ({"mean": "optimal"}, {"mean": "diversity"}, {"bound": "max_trace"}, {"bound": "min_trace"}):
+        assert RULE.guarantee_at(CovarianceUnionParams(**values)) == "none"
 
 
 # Closed forms ---------------------------------------------------------------------------------------------------------
