@@ -19,7 +19,8 @@ def test_rules_as_json_say_what_the_registry_says() -> None:
     listed = strict_json(run("rules", "--json").stdout)
     assert [r["key"] for r in listed] == list(RULES)
     for said, rule in zip(listed, RULES.values(), strict=True):
-        for name in ("title", "family", "arity", "guarantee", "caveat", "source", "cost", "affine_equivariant"):
+        assert said["guarantee"] == rule.promise
+        for name in ("title", "family", "arity", "caveat", "source", "cost", "affine_equivariant"):
             assert said[name] == getattr(rule, name)
         assert said["needs"] == list(rule.needs)
         assert [p["name"] for p in said["parameters"]] == list(specs(rule.params))

@@ -59,7 +59,8 @@ def centre(name: str, oracle: str, prefix: str, topic: str, clock_topic: str) ->
     """Start a centre with the oracle's parameters on /<prefix><source>/<topic>."""
     given = expected(oracle)["parameters"]
     names = {"sources": "source_configurations", "layout": "axes"}
-    params = PATIENT | {names.get(k, k): v for k, v in given.items()}
+    own = {k: v for k, v in given.items() if "." not in k or k.startswith(f"{given['state_fusion']}.")}
+    params = PATIENT | {names.get(k, k): v for k, v in own.items()}
     params["source_types"] = ["odometry" if topic == "odometry" else "track_table"] * len(SOURCES)
     inputs = {f"~/sources/{s}/tracks": f"{prefix}/{s}/{topic}" for s in SOURCES}
     params |= deep(*(f"{t}.subscription" for t in inputs.values()), f"/{name}/tracks.publisher")

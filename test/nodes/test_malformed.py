@@ -473,7 +473,10 @@ def test_trackers_of_other_sensors_and_filters_count_bad_detections_and_track_on
     """Each scan holds one good detection beside the bad ones: the track is the one of the good ones alone."""
     axes = ["x", "y", "vx", "vy", "turn_rate"]
     radar = {"sensor": "range_bearing", "range_sd": 1.0, "bearing_sd": 0.01, "subscribers_deadline_s": START_S}
-    initial = {"initial_mean": [3.0, 4.0, 0.0, 0.0, 0.1], "initial_cov": [1.0, 1.0, 1.0, 1.0, 0.01]}
+    initial = {
+        "initial_mean": [3.0, 4.0, 0.0, 0.0, 0.1], "initial_cov": [1.0, 1.0, 1.0, 1.0, 0.01],
+        "initial_stamp_s": FIRST_NS / 1e9,
+    }  # fmt: skip
     turning = {"axes": axes, "motion": "coordinated_turn", **initial}
     given = {"cubature": turning, "particle": turning | {"particles": 50}, "pda": {"axes": list(AXES)}}
     good = np.array([[5.0, 0.9]])

@@ -27,12 +27,12 @@ def run(make: Callable[[], ManagedNode]) -> int:
     0: ended as asked; 1: a fault; 2: a parameter was wrong.
     """
     node = None
-    try:
-        rclpy.init()
-    except RCLError as error:  # a parameter file that cannot be read, a malformed argument
-        return _failed(str(error), 2)
-    executor = SingleThreadedExecutor()
-    try:
+    try:  # from here on a signal may come, also while rclpy is being initialised
+        try:
+            rclpy.init()
+        except RCLError as error:  # a parameter file that cannot be read, a malformed argument
+            return _failed(str(error), 2)
+        executor = SingleThreadedExecutor()
         node = make()
         executor.add_node(node)
         while rclpy.utilities.ok() and not getattr(node, "finished", False):

@@ -95,7 +95,10 @@ def test_claims_about_the_study_are_judged_as_the_errata_say(study: dict[str, Es
             assert medians == sorted(set(medians))
             assert claim["verdict"] in ("agrees", "undecided")  # twenty problems tell of some steps only
     each = "(judged: with each of their numbers of samples)"
-    assert found[f"exact fusion: DLS and IGS improve on MMGD {each}"]["verdict"] == "agrees"
+    exact = found[f"exact fusion: DLS and IGS improve on MMGD {each}"]
+    *sampled, rough = exact["evidence"].values()
+    assert max(sampled) < rough
+    assert exact["verdict"] in ("agrees", "undecided")  # of the fewest samples twenty problems do not tell
     foci = found[f"WEP fusion: DLS and IGS improve on FOCI {each}"]
     *sampled, rough = foci["evidence"].values()
     assert max(sampled) > rough

@@ -250,9 +250,7 @@ def test_what_errata_says_holds_in_one_run(measured):
 def test_every_claim_is_judged(measured):
     found = {c["claim"]: c["verdict"] for c in judged_claims(SCENARIO, measured)}
     assert len(found) == len(SCENARIO.claims)
-    for c in "AB":
-        assert found[f"Category {c}: CI has a lower NEES than ICI."] == "agrees"
-        assert found[f"Category {c}: CI has a lower NEES than HMD-GA."] == "agrees"
+    assert set(found.values()) <= {"undecided", "by construction"}  # one run tells nothing
     assert measured["given-field_of_view/category_a_targets_1"].value == 3
     assert set(SCENARIO.published) <= set(measured)
 

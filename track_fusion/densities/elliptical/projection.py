@@ -19,7 +19,7 @@ from track_fusion.linalg import Array, inverse, matvec, outer, solve, transpose
 
 MAX_STEPS = 200
 #: A step this short, in standard deviations, or this part of the farthest distance, ends a descent.
-SHORT_STEP, ROUNDING = 1e-9, 1e-14
+SHORT_STEP, ROUNDING = 1e-10, 1e-14
 #: Squared criterion: arccosh(1 + c d)^2 is convex in the mean while arccosh <= 2 x, x tanh x = 1. A minimum whose
 #: sum of squares is below (2 x)^2 lies where every term is convex, outside which one term alone is larger: no
 #: other minimum is lower.
