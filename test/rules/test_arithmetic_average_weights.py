@@ -70,14 +70,15 @@ def test_a_target_that_is_a_mixture_of_the_tracks_gives_its_weights(n: int, coun
 @pytest.mark.parametrize("n", [1, 2])
 def test_weights_of_the_mixture_against_a_search_on_a_grid(n: int) -> None:
     rng = np.random.default_rng(4)
-    points = grid(np.full(n, -14.0), np.full(n, 14.0), 4000 if n == 1 else 280)
+    cells = 4000 if n == 1 else 300
+    points = grid(np.full(n, -30.0), np.full(n, 30.0), cells)
     for _ in range(4):
         mean, cov = 1.5 * rng.normal(size=(3, n)), covariances(rng, 3, n=n)
         target = Mixture(np.array([0.4, 0.6]), rng.normal(size=(2, n)), 1.5 * covariances(rng, 2, n=n))
         fused = fuse(mean, cov, {"target": target}, criterion="target_mixture")
         logs = np.stack([multivariate_normal(m, c).logpdf(points) for m, c in zip(mean, cov, strict=True)])
         parts = [multivariate_normal(m, c).pdf(points) for m, c in zip(target.mean, target.cov, strict=True)]
-        log_target, cell = np.log(target.weight @ parts), (28.0 / (4000 if n == 1 else 280)) ** n
+        log_target, cell = np.log(target.weight @ parts), (60.0 / cells) ** n
 
         def divergence(w: Array) -> float:
             density = np.maximum(w @ np.exp(logs), 1e-300)  # noqa: B023

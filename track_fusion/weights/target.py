@@ -14,7 +14,7 @@ from track_fusion.solvers.optimise import Solution, minimise_on_simplex
 
 #: Expectations over each Gaussian: nodes of Gauss and Hermite an axis, by the number of axes; of more axes, so many
 #: points drawn once and for all.
-NODES, DRAWN = {1: 100, 2: 40, 3: 14, 4: 8}, 4000
+NODES, DRAWN = {1: 100, 2: 60, 3: 16, 4: 8}, 4000
 #: Large batches are worked on in pieces whose arrays stay in the cache.
 CHUNK = 32
 
@@ -32,8 +32,9 @@ def target_weights(mean: Array, cov: Array, target: Mixture) -> Solution:
     -------
     Solution    weights (B, K)
 
-    Notes         With q the mean of the K densities the divergence is the expectation over q of (f / q) log(f / p),
-                  convex in the weights of f at each point, so that it is so on any points with weights.
+    Notes         With q the mean of the K densities the divergence is the expectation over q of
+                  (f / q) log(f / p) - f / q + p / q, convex in the weights of f at each point, so that it is so on any
+                  points with weights; where f is p its slope is zero on any.
     """
     pieces = [slice(at, at + CHUNK) for at in range(0, max(len(mean), 1), CHUNK)]
     return Solution.concatenate([_piece(mean[s], cov[s], target.at(s)) for s in pieces])
@@ -52,7 +53,7 @@ def _piece(mean: Array, cov: Array, target: Mixture) -> Solution:
     def gradient_hessian(w: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
         part = ratio[rows]
         whole = np.einsum("bk,bks->bs", w, part)  # f / q
-        gradient = (part * (chance * (np.log(whole) + beyond[rows] + 1.0))[:, None]).sum(-1)
+        gradient = (part * (chance * (np.log(whole) + beyond[rows]))[:, None]).sum(-1)
         return gradient, (part * (chance / whole)[:, None]) @ transpose(part)
 
     return minimise_on_simplex(gradient_hessian, batch, count)
