@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 from scipy.stats import multivariate_normal, norm
 
 from track_fusion.densities.gaussian import kl_divergence
+from track_fusion.densities.on_grid import grid
 from track_fusion.linalg import Array
 from track_fusion.rules import FusedTracks, Mixture, SourceTracks
 from track_fusion.rules.arithmetic_average import RULE, ArithmeticAverageParams
@@ -49,6 +50,66 @@ def test_target_weights_against_slsqp(count: int) -> None:
         )  # fmt: skip
         assert ours[i] <= divergence(np.maximum(found.x, 0.0) / np.maximum(found.x, 0.0).sum()) + 1e-10
         assert ours[i] >= found.fun - 1e-6
+
+
+# Target (33): the mixture itself --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 6])
+@pytest.mark.parametrize("count", [2, 4])
+def test_a_target_that_is_a_mixture_of_the_tracks_gives_its_weights(n: int, count: int) -> None:
+    """There the divergence is zero, by any sums."""
+    rng = np.random.default_rng(3)
+    mean, cov = 2.0 * rng.normal(size=(40, count, n)), covariances(rng, 40, count, n=n)
+    weights = rng.dirichlet(2.0 * np.ones(count), 40)
+    fused = fuse(mean, cov, {"target": Mixture(weights, mean, cov)}, criterion="target_mixture")
+    assert np.all(fused.info["converged"])
+    np.testing.assert_allclose(fused.weights, weights, atol=1e-5)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_weights_of_the_mixture_against_a_search_on_a_grid(n: int) -> None:
+    rng = np.random.default_rng(4)
+    cells = 4000 if n == 1 else 300
+    points = grid(np.full(n, -30.0), np.full(n, 30.0), cells)
+    for _ in range(4):
+        mean, cov = 1.5 * rng.normal(size=(3, n)), covariances(rng, 3, n=n)
+        target = Mixture(np.array([0.4, 0.6]), rng.normal(size=(2, n)), 1.5 * covariances(rng, 2, n=n))
+        fused = fuse(mean, cov, {"target": target}, criterion="target_mixture")
+        logs = np.stack([multivariate_normal(m, c).logpdf(points) for m, c in zip(mean, cov, strict=True)])
+        parts = [multivariate_normal(m, c).pdf(points) for m, c in zip(target.mean, target.cov, strict=True)]
+        log_target, cell = np.log(target.weight @ parts), (60.0 / cells) ** n
+
+        def divergence(w: Array) -> float:
+            density = np.maximum(w @ np.exp(logs), 1e-300)  # noqa: B023
+            return float((density * (np.log(density) - log_target)).sum() * cell)  # noqa: B023
+
+        least = minimize(
+            divergence, np.full(3, 1.0 / 3.0), method="SLSQP", bounds=[(0.0, 1.0)] * 3,
+            constraints={"type": "eq", "fun": lambda w: w.sum() - 1.0}, options={"ftol": 1e-13, "maxiter": 300},
+        )  # fmt: skip
+        assert fused.weights is not None
+        assert divergence(fused.weights) <= least.fun + 1e-5
+
+
+def test_the_mixture_and_the_merged_gaussian_are_fitted_by_other_weights() -> None:
+    """Two tracks apart, one target about the first: merging hides the second mode, the mixture does not."""
+    mean, cov = np.array([[0.0], [6.0]]), np.ones((2, 1, 1))
+    target = {"target": gaussian(np.array([1.0]), np.array([[4.0]]))}
+    whole, merged = (fuse(mean, cov, target, criterion=c).weights for c in ("target_mixture", "target"))
+    assert whole is not None
+    assert merged is not None
+    assert whole[1] < 0.5 * merged[1]
+
+
+def test_large_batches_are_fitted_in_pieces() -> None:
+    rng = np.random.default_rng(5)
+    mean, cov = rng.normal(size=(70, 3, 2)), covariances(rng, 70, 3, n=2)
+    target = gaussian(np.zeros((70, 2)), np.tile(2.0 * np.eye(2), (70, 1, 1)))
+    whole = fuse(mean, cov, {"target": target}, criterion="target_mixture").weights
+    assert whole is not None
+    alone = fuse(mean[69], cov[69], {"target": target.at(69)}, criterion="target_mixture").weights
+    np.testing.assert_allclose(whole[69], alone, atol=1e-9)
 
 
 def test_a_target_of_one_track_takes_that_track_and_a_mixture_counts_by_its_moments() -> None:

@@ -16,6 +16,7 @@ from track_fusion.rules.shared.weights import GIVEN, UNIFORM, WeightParams, diag
 from track_fusion.solvers.optimise import Solution
 from track_fusion.weights.bound import bound_weights
 from track_fusion.weights.merging import merging_weights
+from track_fusion.weights.target import target_weights
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,9 +26,10 @@ class ArithmeticAverageParams(WeightParams):
     criterion: str = param(
         "diversity",
         "fusion weights: by diversity preference, eq. (40), by its bound, eq. (45), by the least divergence from a "
-        "target density, eq. (39), in proportion to the likelihood of each track's measurements, uniform, or given by "
+        "target density of the merged Gaussian, eq. (39) (target), or of the mixture itself, eq. (33) "
+        "(target_mixture), in proportion to the likelihood of each track's measurements, uniform, or given by "
         "'weights'",
-        choices=("diversity", "bound", "target", "likelihood", "uniform", "given"),
+        choices=("diversity", "bound", "target", "target_mixture", "likelihood", "uniform", "given"),
     )
     output: str = param(
         "merged",
@@ -51,8 +53,9 @@ def fuse(tracks: SourceTracks, params: ArithmeticAverageParams) -> FusedTracks:
     Parameters
     ----------
     tracks : SourceTracks    mean (..., K, n), cov (..., K, n, n); mixtures are averaged as mixtures. Extras: for
-                             criterion target `target`, a Mixture of leading shape (...) or none, taken by its moments;
-                             for criterion likelihood `likelihood` (..., K), not negative
+                             criterion target or target_mixture `target`, a Mixture of leading shape (...) or
+                             none, which the first takes by its moments; for criterion likelihood `likelihood` (..., K),
+                             not negative
     params : ArithmeticAverageParams
 
     Returns
@@ -66,11 +69,12 @@ def fuse(tracks: SourceTracks, params: ArithmeticAverageParams) -> FusedTracks:
     Notes          Weights by diversity, its bound, a target or likelihoods depend on the means, and then there is no
                    promise: three scalar tracks of variances 10.4, 10.4 and 6.4, whose errors are 3, 2 and 2 in four
                    cases of five and else 4, 6 and 4, give by diversity a mean squared error of 1.12 times the
-                   mean claim. The programs (39) and (40) are convex in the weights; at an interior optimum of (40)
-                   all divergences (37) are equal. (45) may have several minima; the best found is taken. Where all
-                   likelihoods are zero, all tracks weigh the same. O(K n^3).
+                   mean claim. The programs (33), (39) and (40) are convex in the weights; at an interior optimum of
+                   (40) all divergences (37) are equal. (33) takes each track by its Gaussian, and expectations by
+                   quadrature, of more than four axes by 4000 points. (45) may have several minima; the best found is
+                   taken. Where all likelihoods are zero, all tracks weigh the same. O(K n^3).
     References     T. Li et al., Some Statistic and Information-theoretic Results on Arithmetic Average
-                   Density Fusion, eqs. (6), (10)-(11), (37), (39), (40), (45), section II-E.
+                   Density Fusion, eqs. (6), (10)-(11), (33), (37), (39), (40), (45), section II-E.
     """
     weights, info = _weights(tracks, params)
     mean, cov = merged_moments(tracks.mean, tracks.cov, weights)
@@ -108,6 +112,11 @@ def _sought(tracks: SourceTracks, criterion: str) -> Solution:
     mean, cov = tracks.flat
     if criterion == "bound":
         return bound_weights(mean, cov)
+    if criterion == "target_mixture":
+        target: Mixture = tracks.extras["target"]
+        whole = target.normalised.broadcast(tracks.batch)
+        return target_weights(mean, cov, Mixture(*(a.reshape(len(mean), *a.shape[len(tracks.batch) :])
+                                                   for a in vars(whole).values())))  # fmt: skip
     slopes = None if criterion == "diversity" else _target_slopes(tracks).reshape(mean.shape[:2])
     return merging_weights(mean, cov, slopes)
 
@@ -138,7 +147,7 @@ def _by_likelihood(tracks: SourceTracks) -> Array:
 
 EXAMPLES = (
     {**UNIFORM, "output": "mixture"}, GIVEN, {"criterion": "bound"}, {"criterion": "target"},
-    {"criterion": "likelihood"}, {"output": "mixture", "merge_threshold": 1.5},
+    {"criterion": "target_mixture"}, {"criterion": "likelihood"}, {"output": "mixture", "merge_threshold": 1.5},
 )  # fmt: skip
 
 RULE = Rule(
@@ -151,9 +160,13 @@ RULE = Rule(
     guarantee=lambda params: "conservative" if params.criterion in ("uniform", "given") else "none",
     caveat="conservative with criterion uniform or given, whose weights do not depend on the means, if every track is; "
     "else errors of 1.12 times the claim in the example",
-    source="Li 2022 (6), (10)-(11), (39), (40), (45)",
+    source="Li 2022 (6), (10)-(11), (33), (39), (40), (45)",
     cost="K n^3, about ten times that for weights that are sought with K > 2",
-    needs_when=(("target", "criterion", "target"), ("likelihood", "criterion", "likelihood")),
+    needs_when=(
+        ("target", "criterion", "target"),
+        ("target", "criterion", "target_mixture"),
+        ("likelihood", "criterion", "likelihood"),
+    ),
     takes_particles=True,
     takes_phds=True,
     example=Example(({}, *EXAMPLES), idempotent=True),

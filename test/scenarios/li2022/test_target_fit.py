@@ -13,12 +13,15 @@ from track_fusion.scenarios import RuleChoice, judged_claims, judged_figures
 from track_fusion.scenarios.li2022.target_fit import (
     BEST,
     DENSITIES,
+    FITTED,
     MOMENTS,
+    POINTS,
     SCENARIO,
     TARGETS,
     WEIGHTS,
     best,
     fit,
+    fitted,
     mixture,
 )
 
@@ -90,6 +93,44 @@ def test_a_mixture_that_is_not_merged_beats_the_best_density_in_case_3_only(meas
     assert len(judged) == len(SCENARIO.claims)
     text = "case {}: the average, not merged, fits the target better than the best single density"
     assert {c for c, v in judged.items() if v == "contradicts"} == {text.format("1"), text.format("2")}
+
+
+@pytest.mark.parametrize("case", TARGETS)
+def test_the_mixture_itself_is_fitted_by_its_own_weights(measured, case):
+    """(33), by a search over the weights of the same sums: no better, and not the weights (39)."""
+    logs = norm.logpdf(POINTS, MEANS, np.sqrt(VARIANCES))
+    target, cell = norm.logpdf(POINTS[:, 0], TARGETS[case][0], np.sqrt(TARGETS[case][1])), POINTS[1, 0] - POINTS[0, 0]
+
+    def divergence(weights):
+        density = np.exp(logs) @ weights
+        return cell * (density * (np.log(np.maximum(density, 1e-300)) - target)).sum()
+
+    search = minimize(
+        divergence, np.full(4, 0.25), method="SLSQP", bounds=[(0.0, 1.0)] * 4, options={"ftol": 1e-13, "maxiter": 300},
+        constraints={"type": "eq", "fun": lambda w: w.sum() - 1.0},
+    )  # fmt: skip
+    ours = fit(FITTED, case)
+    assert ours.info["converged"]
+    assert measured[f"{fitted(case)}/kld_nats"].value <= search.fun + 1e-6
+    np.testing.assert_allclose(ours.weights, search.x, atol=2e-3)
+    for i, weight in enumerate(ours.weights, 1):
+        assert measured[f"{fitted(case)}/weight_{i}_1"].value == weight
+    assert measured[f"{fitted(case)}/kld_nats"].value <= measured[f"{mixture(case)}/kld_nats"].value + 1e-9
+
+
+def test_the_two_fits_differ(measured):
+    """In cases 1 to 3 the mixture at the printed weights, which are those of the merged Gaussian, fits worse."""
+    for case in ("1", "2", "3"):
+        gain = measured[f"{mixture(case)}/kld_nats"].value - measured[f"{fitted(case)}/kld_nats"].value
+        assert gain > 1e-3
+
+
+def test_charts_show_both_fits():
+    charts = SCENARIO.charts(SCENARIO.simulate([0], 0, lambda share: None, "given-arithmetic_average"))
+    last = charts[0].series[-1]
+    assert last.label == "the mixture that fits best itself"
+    weights = fit(FITTED, "1").weights
+    np.testing.assert_allclose(last.y, norm.pdf(last.x[:, None], MEANS, np.sqrt(VARIANCES)) @ weights, atol=1e-12)
 
 
 def test_charts(measured):
