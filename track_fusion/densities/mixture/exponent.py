@@ -92,11 +92,11 @@ def optimise_omega(
         step = max(1, CHUNK // max(3 * most, 1))
         for rows in (doubtful[at : at + step] for at in range(0, len(doubtful), step)):
             best.replace(rows, _with_more(problem.flat(lead).at(rows), logs.flat.at(rows), seeds, criterion, tolerance))
-        found = best.shaped(lead)
+        solution = best.shaped(lead)
     else:
-        found = _Search(omega, np.zeros(lead), np.ones(lead, bool), np.zeros(lead, np.intp))
-    converged = found.converged & (found.error <= tolerance)
-    return Omega(found.omega, found.error, logs.weighted(points, found.omega), converged, found.iterations)
+        solution = _Search(omega, np.zeros(lead), np.ones(lead, bool), np.zeros(lead, np.intp))
+    converged = solution.converged & (solution.error <= tolerance)
+    return Omega(solution.omega, solution.error, logs.weighted(points, solution.omega), converged, solution.iterations)
 
 
 def overlap_proposal(first: Mixture, second: Mixture) -> Mixture:
@@ -199,15 +199,15 @@ def _search(logs: _Logs, criterion: str) -> _Search:
         mean = (share * c).sum(-1)
         return pull[rows] + mean, (share * (c - mean[:, None]) ** 2).sum(-1)
 
-    found = minimise_on_interval(derivatives, len(pull))
-    omega = found.weights
+    solution = minimise_on_interval(derivatives, len(pull))
+    omega = solution.weights
     share = normalised(omega[:, None] * contrast + base)
     mean = (share * contrast).sum(-1)
     centred = contrast - mean[:, None]
     # Each sample's part in the slope: that of a ratio of means in its numerator and denominator.
     part = share * centred - naive * (contrast + pull[:, None])
     curvature = (share * centred**2).sum(-1)
-    return _Search(omega, _error(part, pull + mean, curvature), found.converged, found.iterations)
+    return _Search(omega, _error(part, pull + mean, curvature), solution.converged, solution.iterations)
 
 
 def _error(part: Array, slope: Array, curvature: Array) -> Array:
