@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 import rclpy
 import rclpy.utilities
@@ -71,7 +72,8 @@ def _close(node: ManagedNode | None) -> None:
         if node is not None:
             node.close()
     finally:
-        rclpy.utilities.try_shutdown()
+        with suppress(RCLError):  # a signal may have shut the context down between the look and the call
+            rclpy.utilities.try_shutdown()
 
 
 def end(code: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from typing import Any
 
@@ -20,6 +21,9 @@ from track_fusion.params import Fault, ParameterError, Params, param
 
 #: How often the state of the network and the deadline are looked at, wall time.
 LOOK_PERIOD_S = 0.02
+#: A writer may know of a reader before the reader knows of the writer, and then drops what comes: the start waits so
+#: long after all are there, wall time.
+SETTLE_S = 0.3
 #: At the end, readers that are still there take the last messages within this wall time.
 ACK_DEADLINE_S = 2
 
@@ -56,6 +60,7 @@ class ReplayNode(ManagedNode):
         self.params, self.scenario = declare(self, ReplayParams), declare(self, ScenarioParams)
         self.bag = declare(self, BagParams, "bag_")
         self.finished = self._started = False
+        self._complete_s = math.inf
         if self.params.bag and self.params.pace == "lockstep" and "pace" in self._parameter_overrides:
             raise ParameterError("The 'pace' parameter must be realtime with a bag. Got 'lockstep'.")
 
@@ -83,10 +88,13 @@ class ReplayNode(ManagedNode):
             if awaited := self._player.awaited():
                 self._check_deadline(f"{awaited} {missing or 'All topics are connected.'}")
         elif missing:
+            self._complete_s = math.inf
             self._check_deadline(missing)
         else:
-            self._started, self._began_s = True, time.monotonic()
-            self._player.start(self._finish)
+            self._complete_s = min(self._complete_s, time.monotonic())
+            if time.monotonic() - self._complete_s >= SETTLE_S:
+                self._started, self._began_s = True, time.monotonic()
+                self._player.start(self._finish)
 
     def _check_deadline(self, what: str) -> None:
         if time.monotonic() - self._player.since_s > self.params.deadline_s:
