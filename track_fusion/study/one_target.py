@@ -165,6 +165,12 @@ def _moments(tracking: Tracking, state: TrackState) -> tuple[Array, Array]:
     return mean, cov
 
 
+def gaussian_rows(name: str, tracking: Tracking, filters: Filters, choices: Sequence[RuleChoice]) -> dict[str, Row]:
+    """Every row by filters of this name: sensor 1 alone, both in one filter (ic), and each rule."""
+    table = {f"{name}-alone": alone_row(tracking, filters, 1), f"{name}-ic": alone_row(tracking, filters, 2)}
+    return table | {f"{name}-{choice.name}": fused_row(tracking, filters, choice) for choice in choices}
+
+
 def sir_rows(tracking: Tracking, sir: SirParams, choices: Sequence[RuleChoice]) -> dict[str, Row]:
     """Every row by particle filters; the arithmetic average joins the particles, or (@gaussian) their Gaussians.
 

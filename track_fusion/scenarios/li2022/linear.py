@@ -25,7 +25,7 @@ from track_fusion.scenarios.li2022.claims import (
     RULES as ROWS,
 )
 from track_fusion.study.claim import Claim, ascending
-from track_fusion.study.one_target import RULE_CHOICES, Row, alone_row, fused_row, same_filters, sir_rows
+from track_fusion.study.one_target import RULE_CHOICES, Row, fused_row, gaussian_rows, same_filters, sir_rows
 from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
 from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.study.scenario import Printed, Scenario
@@ -72,16 +72,10 @@ def kalman_row(choice: RuleChoice) -> Row:
 
 def kalman_rows() -> dict[str, Row]:
     """Rows of Table I by Kalman filters."""
-    table = {"kf-alone": alone_row(TRACKING, KF, 1), "kf-ic": alone_row(TRACKING, KF, 2)}
-    return table | {f"kf-{choice.name}": kalman_row(choice) for choice in RULE_CHOICES}
+    return gaussian_rows("kf", TRACKING, KF, RULE_CHOICES)
 
 
-def particle_rows() -> dict[str, Row]:
-    """Rows of Table I by particle filters."""
-    return sir_rows(TRACKING, SIR, RULE_CHOICES)
-
-
-STUDY = OneTargetStudy(TRACKING, QUANTITIES, kalman_rows() | particle_rows(), ("kf", kalman_row))
+STUDY = OneTargetStudy(TRACKING, QUANTITIES, kalman_rows() | sir_rows(TRACKING, SIR, RULE_CHOICES), ("kf", kalman_row))
 
 
 #: Two rows are close to each other if all of Table I that the text calls so are: SIR-CI is 6 % above SIR-AA.

@@ -21,7 +21,7 @@ from track_fusion.scenarios.li2022.claims import (
     weight_claims,
 )
 from track_fusion.study.claim import Claim, ascending
-from track_fusion.study.one_target import RULE_CHOICES, Row, alone_row, fused_row, same_filters, sir_rows
+from track_fusion.study.one_target import RULE_CHOICES, Row, fused_row, gaussian_rows, same_filters, sir_rows
 from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
 from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.study.scenario import Printed, Scenario
@@ -76,16 +76,12 @@ def cubature_row(choice: RuleChoice) -> Row:
 
 def cubature_rows() -> dict[str, Row]:
     """Rows of Table II by cubature Kalman filters."""
-    table = {"ckf-alone": alone_row(TRACKING, CKF, 1), "ckf-ic": alone_row(TRACKING, CKF, 2)}
-    return table | {f"ckf-{choice.name}": cubature_row(choice) for choice in RULE_CHOICES}
+    return gaussian_rows("ckf", TRACKING, CKF, RULE_CHOICES)
 
 
-def particle_rows() -> dict[str, Row]:
-    """Rows of Table II by particle filters."""
-    return sir_rows(TRACKING, SIR, RULE_CHOICES)
-
-
-STUDY = OneTargetStudy(TRACKING, QUANTITIES, cubature_rows() | particle_rows(), ("ckf", cubature_row))
+STUDY = OneTargetStudy(
+    TRACKING, QUANTITIES, cubature_rows() | sir_rows(TRACKING, SIR, RULE_CHOICES), ("ckf", cubature_row)
+)
 
 
 #: Two rows are close to each other if all of Table II that the text calls so are: SIR-CI is 7 % above CKF-IC.
