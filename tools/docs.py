@@ -211,6 +211,7 @@ def fusion_centre_sections() -> list[Section]:
     from track_fusion.centre.config import (
         TRACK_RULES,
         FusionCentreParams,
+        IdentityParams,
         ScanBufferParams,
         StateFusionParams,
         TrackManagerParams,
@@ -231,7 +232,7 @@ def fusion_centre_sections() -> list[Section]:
             Section(rule.params, f"{key}.", f"{rule.title}: {declared} {key}.", declared=key == default)
             for key, rule in rules.items()
         ),
-        *map(Section, (ScanBufferParams, TrackManagerParams)),
+        *map(Section, (ScanBufferParams, TrackManagerParams, IdentityParams)),
         Section(RandomParams, title="Random numbers of rules that draw samples: seed, run and role name a stream."),
         Section(ManagedParams),
     ]

@@ -9,7 +9,13 @@ from oracles.kalman import predict, update
 from scipy.stats import chi2
 
 from track_fusion.centre.centre import FusionCentre
-from track_fusion.centre.config import CentreConfig, FusionCentreParams, SourceConfig, TrackManagerParams
+from track_fusion.centre.config import (
+    CentreConfig,
+    FusionCentreParams,
+    IdentityParams,
+    SourceConfig,
+    TrackManagerParams,
+)
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
 from track_fusion.params import ParameterError
@@ -28,7 +34,8 @@ EAGER = TrackManagerParams(confirmation_threshold=(1, 1))
 def fusion_centre(sources, motion, rule, rule_params=None, params=None, **others):
     names = tuple(SourceConfig(f"source_{k}") for k in range(sources))
     params = params or FusionCentreParams()
-    return FusionCentre(CentreConfig(names, motion, "map", rule, rule_params or rule.params(), params, **others))
+    given = {"identity": IdentityParams("test")} | others
+    return FusionCentre(CentreConfig(names, motion, "map", rule, rule_params or rule.params(), params, **given))
 
 
 def centre(sources=2, rule="covariance_intersection", rule_params=None, manager=EAGER, motion=None, **params):
@@ -448,7 +455,8 @@ def test_a_sources_uuid_is_not_taken_for_the_central_tracks():
     uuid = np.arange(32, dtype=np.uint8).reshape(2, 16)
     batch = tracks([[0, 0], [50, 0]], 0).replace(uuid=uuid)
     fused, _ = centre().step(0, {0: batch, 1: tracks([[0, 0]], 0)})
-    assert fused.uuid is None
+    without, _ = centre().step(0, {0: batch.replace(uuid=None), 1: tracks([[0, 0]], 0)})
+    assert fused.uuid.tolist() == without.uuid.tolist()
 
 
 @pytest.mark.parametrize(

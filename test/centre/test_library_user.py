@@ -12,6 +12,7 @@ from track_fusion.centre.centre import FusionCentre
 from track_fusion.centre.config import (
     CentreConfig,
     FusionCentreParams,
+    IdentityParams,
     ScanBufferParams,
     SourceConfig,
     TrackManagerParams,
@@ -29,7 +30,8 @@ def fusion_centre(**buffer):
     rule, motion = RULES["covariance_intersection"], NearlyConstantVelocity(LAYOUT, MotionParams(process_noise=5.0))
     manager = TrackManagerParams(confirmation_threshold=(1, 1), max_coast_s=MAX_COAST_S)
     sources, params = (SourceConfig("a"), SourceConfig("b")), FusionCentreParams(max_scan_age_s=0.3)
-    config = CentreConfig(sources, motion, "map", rule, rule.params(), params, manager, ScanBufferParams(**buffer))
+    waits, identity = ScanBufferParams(**buffer), IdentityParams("test")
+    config = CentreConfig(sources, motion, "map", rule, rule.params(), params, manager, waits, identity=identity)
     return FusionCentre(config)
 
 

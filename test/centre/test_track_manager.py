@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from track_fusion.centre.config import CentreConfig, SourceConfig, TrackManagerParams
+from track_fusion.centre.config import CentreConfig, IdentityParams, SourceConfig, TrackManagerParams
 from track_fusion.centre.fuse import Fused
+from track_fusion.centre.identity import Identities
 from track_fusion.centre.manage import manage
 from track_fusion.centre.state import CentralTracks
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
@@ -22,7 +23,8 @@ class Life:
     def __init__(self, sources=2, **params):
         names = tuple(SourceConfig(str(k)) for k in range(sources))
         motion, rule = NearlyConstantVelocity(LAYOUT, MotionParams()), RULES["naive"]
-        self.central = CentralTracks.none(CentreConfig(names, motion, "map", rule, rule.params()))
+        config = CentreConfig(names, motion, "map", rule, rule.params())
+        self.central = CentralTracks.none(config, Identities.begun(IdentityParams("test")))
         self.params, self.sources, self.time = TrackManagerParams(**params), sources, 0
 
     def step(self, fresh, members, births=0, dt_s=0.1):

@@ -41,11 +41,12 @@ class FusionCentre:
 
     def __init__(self, config: CentreConfig) -> None:
         self.config = config
-        self.reset()
+        self.state, self.buffer = CentreState.initial(config), ScanBuffer.empty(config)
 
     def reset(self) -> None:
-        """Forget all tracks and scans."""
-        self.state, self.buffer = CentreState.initial(self.config), ScanBuffer.empty(self.config)
+        """Forget all tracks and scans; identities go on, so that none is given again."""
+        given = self.state.central.identities
+        self.state, self.buffer = CentreState.initial(self.config, given), ScanBuffer.empty(self.config)
 
     @property
     def tracks(self) -> TrackBatch:

@@ -127,6 +127,17 @@ class TrackManagerParams(Params):
                 raise ParameterError(f"The '{name}' parameter must be two integers, the first not larger. Got {value}.")
 
 
+@dataclasses.dataclass(frozen=True)
+class IdentityParams(Params):
+    """What central tracks are called."""
+
+    identity_namespace: str = param(
+        "",
+        "name from which the UUIDs of central tracks are made, ids counting from 1: the same in every run; empty: a "
+        "namespace drawn at start, ids counting from a number made from the time, so that no restart gives one again",
+    )
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class SourceConfig:
     """What is known of a source of tracks.
@@ -159,6 +170,7 @@ class CentreConfig:
     manager : TrackManagerParams
     buffer : ScanBufferParams
     random : RandomParams              what rules that sample draw from, step after step
+    identity : IdentityParams
 
     Raises
     ------
@@ -176,6 +188,7 @@ class CentreConfig:
     manager: TrackManagerParams = TrackManagerParams()
     buffer: ScanBufferParams = ScanBufferParams()
     random: RandomParams = RandomParams(role="fusion_centre")
+    identity: IdentityParams = IdentityParams()
 
     def __post_init__(self) -> None:
         if len(self.sources) > MAX_SOURCES:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from track_fusion.centre.config import TrackManagerParams
 from track_fusion.centre.fuse import Fused
+from track_fusion.centre.identity import Identities
 from track_fusion.centre.state import Bools, CentralTracks
 from track_fusion.tracks import COASTED, CONFIRMED, SECOND_NS
 
@@ -44,7 +45,7 @@ def manage(
     Changes
     """
     new = len(fused.tracks) - len(before)
-    ids = np.concatenate([before.tracks.track_id, before.next_id + np.arange(new)])
+    ids, uuids, identities = _named(before, new)
     hit = member & fresh
     history = _grown(before.history, new)
     history = np.where(fresh, (history << np.uint32(1)) | hit, history)
@@ -52,13 +53,25 @@ def manage(
     coasted = np.asarray(~member.any(1))
     confirmed = was_confirmed if was_confirmed.all() else was_confirmed | _confirmed(params, history)
     after = CentralTracks(
-        fused.tracks.replace(track_id=ids, status=confirmed * np.uint8(CONFIRMED) + coasted * np.uint8(COASTED)),
+        fused.tracks.replace(
+            track_id=ids, uuid=uuids, status=confirmed * np.uint8(CONFIRMED) + coasted * np.uint8(COASTED)
+        ),
         fused.has, history, _grown(before.updates, new) + fresh, _grown(before.hit_ever, new) | hit,
-        np.where(supported_ns >= 0, supported_ns, _grown(before.supported_ns, new)), before.next_id + new,
+        np.where(supported_ns >= 0, supported_ns, _grown(before.supported_ns, new)), identities,
     )  # fmt: skip
     dead = coasted & _expired(params, after) if coasted.any() else coasted
     changes = Changes(ids[len(before) :], ids[confirmed & ~was_confirmed & ~dead], ids[dead])
     return after[~dead] if dead.any() else after, changes
+
+
+def _named(before: CentralTracks, new: int) -> tuple[NDArray[np.int64], NDArray[np.uint8], Identities]:
+    """Numbers and UUIDs of the old tracks, then of so many newborn; the only place where they are given."""
+    tracks = before.tracks
+    assert tracks.uuid is not None  # central tracks have one
+    if new == 0:
+        return tracks.track_id, tracks.uuid, before.identities
+    ids, uuids, identities = before.identities.given(new)
+    return np.concatenate([tracks.track_id, ids]), np.concatenate([tracks.uuid, uuids]), identities
 
 
 def _grown(array: NDArray[Any], new: int) -> NDArray[Any]:

@@ -104,7 +104,7 @@ class Pool:
             k: scan for k, scan in enumerate(newest)
             if scan is not None and (fresh[k] or not config.params.memory) and _is_young(config, scan, time_ns)
         }  # fmt: skip
-        before = [*scans.values(), central.tracks]
+        before = [*scans.values(), central.tracks.replace(uuid=None)]  # an identity takes no part in a fusion
         after = [predicted_to(batch, time_ns, config.motion) for batch in before]
         tracks = TrackBatch.concatenate(after)
         mean, cov = tracks.moments

@@ -23,6 +23,7 @@ from track_fusion.centre.config import (
     MAX_SOURCES,
     CentreConfig,
     FusionCentreParams,
+    IdentityParams,
     ScanBufferParams,
     SourceConfig,
     StateFusionParams,
@@ -103,6 +104,7 @@ class FusionCentreNode(ManagedNode):
             CentreConfig(
                 sources, motion, self.frame.frame_id, rule, rule_params, declare(self, FusionCentreParams),
                 declare(self, TrackManagerParams), declare(self, ScanBufferParams), declare(self, RandomParams),
+                declare(self, IdentityParams),
             )
         )  # fmt: skip
         self._latency_s = 0.0
