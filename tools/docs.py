@@ -213,6 +213,7 @@ def fusion_centre_sections() -> list[Section]:
         FusionCentreParams,
         IdentityParams,
         ScanBufferParams,
+        SourceSettings,
         StateFusionParams,
         TrackManagerParams,
     )
@@ -225,7 +226,12 @@ def fusion_centre_sections() -> list[Section]:
     default, declared = StateFusionParams().state_fusion, "declared when state_fusion is"
     rules = {key: rule for key, rule in TRACK_RULES.own.items() if specs(rule.params)}
     return [
-        *map(Section, (FrameParams, SourceParams, MotionChoice)),
+        *map(Section, (FrameParams, SourceParams)),
+        *(
+            Section(SourceSettings, f"{name}.", f"What is declared of {name}.")
+            for name in SourceParams().source_configurations
+        ),
+        Section(MotionChoice),
         *_alternatives("motion", MOTIONS.own, MotionChoice().motion),
         *map(Section, (StateFusionParams, FusionCentreParams)),
         *(

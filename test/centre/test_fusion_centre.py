@@ -92,7 +92,9 @@ def test_random_scenes_equal_the_oracle(seed, count, memory):
     assert min(margins["gate"] + margins["assignment"], default=1.0) > 1e-9, "a decision hangs on rounding"
 
     given = {k: getattr(settings, k) for k in ("gate_probability", "max_scan_age_s", "memory")}
-    manager = TrackManagerParams(**{k: getattr(settings, k) for k in TrackManagerParams.__dataclass_fields__})
+    manager = TrackManagerParams(
+        **{k: v for k, v in vars(settings).items() if k in TrackManagerParams.__dataclass_fields__}
+    )
     motion = MotionParams(noise_form="piecewise_constant", process_noise=settings.process_noise)
     rule_params = ArithmeticAverageParams(criterion="uniform") if rule is arithmetic_average else None
     fuser = centre(count, rule.__name__, rule_params, manager, motion, **given)

@@ -26,6 +26,7 @@ class Life:
         config = CentreConfig(names, motion, "map", rule, rule.params())
         self.central = CentralTracks.none(config, Identities.begun(IdentityParams("test")))
         self.params, self.sources, self.time = TrackManagerParams(**params), sources, 0
+        self.stamps = ((),) * sources
 
     def step(self, fresh, members, births=0, dt_s=0.1):
         """`members`: for each living track, then each newborn, the set of sources with a member in it."""
@@ -39,7 +40,7 @@ class Life:
         supported = np.array([self.time if m else -1 for m in members], np.int64)
         fresh = np.isin(np.arange(self.sources), list(fresh))
         fused = Fused(fused, np.ones((count, 4), bool))
-        self.central, changes = manage(self.params, self.central, fused, member, fresh, supported)
+        self.central, changes = manage(self.params, self.central, fused, member, fresh, supported, self.stamps)
         return changes
 
     @property

@@ -76,7 +76,8 @@ def add(
     Returns
     -------
     ScanBuffer
-    str or None    `stale_scan`, `out_of_order_scan`, `duplicate_scan`, `late_scan`, `duplicate_track_id`
+    str or None    `stale_scan`, `out_of_order_scan`, `duplicate_scan`, `late_scan`, `duplicate_track_id`,
+                   `too_many_tracks` (of pieces put together, too; as if the source had not been heard)
     """
     # The silence of sources that were never heard begins with the first scan of any.
     queues = [q if q.heard_ns >= 0 else Queue(heard_ns=now_ns) for q in buffer.queues]
@@ -86,6 +87,9 @@ def add(
         queue, reason = _assembled(config.sources[source].assembles, queue, scan)
     elif reason is None:
         queue = Queue((*queue.waiting, Waiting(stamp_ns, now_ns, scan.owned())), stamp_ns, now_ns)
+    most = config.sources[source].settings.max_tracks_per_scan
+    if reason is None and any(len(waiting.scan) > most for waiting in queue.waiting):
+        return buffer, "too_many_tracks"
     queues[source] = queue
     return ScanBuffer(tuple(queues), buffer.fused_ns), reason
 

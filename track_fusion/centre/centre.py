@@ -60,8 +60,13 @@ class FusionCentre:
         return published, info
 
     def receive(self, source: int, scan: TrackBatch, stamp_ns: int, now_ns: int) -> str | None:
-        """Take in a scan; return None, or why it was turned away: see :func:`track_fusion.centre.buffer.add`."""
-        self.buffer, reason = buffer.add(self.config, self.buffer, source, scan, stamp_ns, now_ns)
+        """Take in a scan; return None, or why it was turned away: see :func:`track_fusion.centre.buffer.add`.
+
+        Here its stamps, as the source tells them, become those of the centre's clock: later by its `time_offset_s`.
+        """
+        offset_ns = self.config.sources[source].settings.time_offset_ns
+        scan = scan.replace(time_ns=scan.time_ns + offset_ns) if offset_ns else scan
+        self.buffer, reason = buffer.add(self.config, self.buffer, source, scan, stamp_ns + offset_ns, now_ns)
         return reason
 
     def advance(self, now_ns: int) -> Iterator[Published]:

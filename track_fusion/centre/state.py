@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from track_fusion.centre.config import CentreConfig
 from track_fusion.centre.identity import Identities
+from track_fusion.centre.rhythm import Stamps
 from track_fusion.random_streams import StreamPosition
 from track_fusion.tracks import ROW_FIELDS, UUID_BYTES, TrackBatch
 
@@ -71,12 +72,14 @@ class CentreState:
     ----------
     central : CentralTracks
     newest : tuple of TrackBatch or None    newest scan of each source, its own, in the centre's axes and frame
+    stamps : tuple of Stamps                the newest few of each source's scans
     random : StreamPosition or None         where the stream of a rule that draws stands
     time_ns : int                           of the last step, -1 before the first
     """
 
     central: CentralTracks
     newest: tuple[TrackBatch | None, ...]
+    stamps: tuple[Stamps, ...]
     random: StreamPosition | None = None
     time_ns: int = -1
 
@@ -85,7 +88,8 @@ class CentreState:
         """Nothing known yet; identities begin now, unless they go on from those given."""
         random = StreamPosition.of(config.random.stream()) if config.draws else None
         central = CentralTracks.none(config, identities or Identities.begun(config.identity))
-        return cls(central, (None,) * len(config.sources), random)
+        sources = len(config.sources)
+        return cls(central, (None,) * sources, ((),) * sources, random)
 
     def __post_init__(self) -> None:
         own = self.central

@@ -26,6 +26,7 @@ from track_fusion.centre.config import (
     IdentityParams,
     ScanBufferParams,
     SourceConfig,
+    SourceSettings,
     StateFusionParams,
     TrackManagerParams,
 )
@@ -75,6 +76,11 @@ class SourceParams(Params):
             raise ParameterError(
                 f"The 'source_configurations' parameter must hold 1 to {MAX_SOURCES} distinct names. Got {list(names)}."
             )
+        if taken := sorted(set(names) & set(RULES)):
+            raise ParameterError(
+                f"The 'source_configurations' parameter must not hold names of fusion rules, whose parameters begin "
+                f"with them. Got {', '.join(taken)}."
+            )
         if self.source_types and len(self.source_types) != len(names):
             raise ParameterError(
                 f"The 'source_types' parameter must hold one type a source, {len(names)}. "
@@ -98,8 +104,10 @@ class FusionCentreNode(ManagedNode):
         rule = RULES[declare(self, StateFusionParams).state_fusion]
         refuse_of_others(self, RULES, "state_fusion", rule.key)
         rule_params = declare(self, rule.params, f"{rule.key}.")
-        names = zip(self.sources.source_configurations, self.kinds, strict=True)
-        sources = tuple(SourceConfig(name, assembles=not kind.whole_scan) for name, kind in names)
+        sources = tuple(
+            SourceConfig(name, assembles=not kind.whole_scan, settings=declare(self, SourceSettings, f"{name}."))
+            for name, kind in zip(self.sources.source_configurations, self.kinds, strict=True)
+        )
         self.centre = FusionCentre(
             CentreConfig(
                 sources, motion, self.frame.frame_id, rule, rule_params, declare(self, FusionCentreParams),
@@ -138,22 +146,23 @@ class FusionCentreNode(ManagedNode):
         )
 
     def _reader(self, source: int, kind: MessageType) -> Callable[[Any], None]:
+        offset_ns = self.centre.config.sources[source].settings.time_offset_ns
         cross_block: CrossBlock = "conservative" if self.sources.cross_block == "conservative" else "block_diagonal"
 
         def read(msg: Any) -> None:
             now = self.now_ns()
-            stamp_ns = check_header(
-                msg.header, frame_id=self.frame.frame_id, now_ns=now, max_future_ns=self.frame.max_future_ns
+            stamp_ns = check_header(  # by the source's clock
+                msg.header, frame_id=self.frame.frame_id, now_ns=now - offset_ns, max_future_ns=self.frame.max_future_ns
             )
             tracks, supplied = kind.read(msg, self.centre.config.layout.axes, cross_block)
             if kind.lacks:
                 self.counted[f"{kind.lacks}_absent"] += supplied
-            self._take(source, screened_tracks(self, tracks, self.centre.config.layout), stamp_ns, now)
+            scan = screened_tracks(self, tracks, self.centre.config.layout)
+            self._take(source, scan, stamp_ns, max(now, stamp_ns + offset_ns))
 
         return read
 
     def _take(self, source: int, scan: TrackBatch, stamp_ns: int, now_ns: int) -> None:
-        now_ns = max(now_ns, stamp_ns)
         if reason := self.centre.receive(source, scan, stamp_ns, now_ns):
             name = self.sources.source_configurations[source]
             self.reject({reason: 1}, f"a scan of {name} stamped {stamp_ns / 1e9:.3f} s")
@@ -181,6 +190,7 @@ class FusionCentreNode(ManagedNode):
             self.counted["unsound"] += result.info.unsound
             self.counted["beyond_half_circle"] += result.info.beyond_half_circle
             self.counted["deleted"] += len(result.info.changes.deleted)
+            self.counted["dropped_tentative"] += len(result.info.changes.dropped)
             began = time.perf_counter()
 
     def _publish(self, fused: TrackBatch, stamp_ns: int) -> None:
@@ -207,6 +217,8 @@ class FusionCentreNode(ManagedNode):
             warnings.append(f"{unsound} fusions gave no density; a single source was taken instead")
         if beyond := self.counted["beyond_half_circle"]:
             warnings.append(f"{beyond} fusions were of angles more than a half circle apart, which have no mean")
+        if dropped := self.counted["dropped_tentative"]:
+            warnings.append(f"{dropped} tentative tracks were dropped: more than max_tentative_tracks at a time")
         if self._last is not None:
             values["members"] = self._last.members.tolist()
             if self._last.shared_provenance and rule.guarantee_at(self.centre.config.rule_params) != "conservative":
