@@ -183,7 +183,7 @@ def test_charts_of_a_single_run(key):
 
 
 def test_charts_are_two_sigma_ellipses(outcomes):
-    pictures = sharma_network_1.charts(outcomes["1"])
+    pictures = sharma_network_1.SCENARIO.charts(outcomes["1"])
     assert [len(c.series) for c in pictures] == [6, 6, 6, 6, 2]
     reported, errors = pictures[0].series[:2]
     cov = outcomes["1"]["kf-centralised/cov"][0]

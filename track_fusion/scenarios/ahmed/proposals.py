@@ -28,7 +28,6 @@ from track_fusion.densities.mixture.quotient import (
 )
 from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.params import from_dict
 from track_fusion.random_streams import stream
 from track_fusion.rules import RULES
 from track_fusion.scenarios.ahmed import PAPER
@@ -71,8 +70,7 @@ VALUES: dict[str, dict[str, Any]] = {
     for proposal in PROPOSALS
 } | {"laplace": {"method": "laplace"}}
 RULE_CHOICES = tuple(
-    RuleChoice("mixture_exact", from_dict(RULES["mixture_exact"].params, {"max_components": 0} | values), variant)
-    for variant, values in VALUES.items()
+    RuleChoice.of("mixture_exact", variant, max_components=0, **values) for variant, values in VALUES.items()
 )
 
 

@@ -70,7 +70,7 @@ RULE_CHOICES = (
     RuleChoice("mixture_exact", dataclasses.replace(DLS, method="igs", samples=2000), "igs"),
     RuleChoice("mixture_exact", dataclasses.replace(DLS, method="mmgd"), "mmgd"),
     RuleChoice("mixture_wep", WEP),
-    RuleChoice("mixture_wep", MixtureWepParams(method="naive_bayes", max_components=COMPONENTS), "naive_bayes"),
+    RuleChoice.of("mixture_wep", "naive_bayes", method="naive_bayes", max_components=COMPONENTS),
 )
 #: The centre; robot 3 before it hears of the others; the quotient of the robots' mixtures itself, on the grid.
 CENTRE, ALONE, QUOTIENT = "gm-ic", "gm-alone", "gm-mixture_exact@unapproximated"

@@ -11,8 +11,6 @@ import numpy as np
 from track_fusion.densities.gaussian import weighted_product
 from track_fusion.linalg import Array, merged_moments
 from track_fusion.rules import SourceTracks
-from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
-from track_fusion.rules.geometric_average import GeometricAverageParams
 from track_fusion.scenarios.li2019 import PAPER
 from track_fusion.scenarios.li2019.averages import density_average, density_moments
 from track_fusion.study.chart import Chart, Contours, Series
@@ -26,8 +24,8 @@ WEIGHT = np.linspace(0.0, 1.0, 101)[1:-1]
 THETA = np.linspace(40.0, 80.0, 401)
 AA, GA = "given-arithmetic_average", "given-geometric_average"
 RULE_CHOICES = (
-    RuleChoice("arithmetic_average", ArithmeticAverageParams(criterion="given", weights=(0.5, 0.5))),
-    RuleChoice("geometric_average", GeometricAverageParams(criterion="given", weights=(0.5, 0.5))),
+    RuleChoice.of("arithmetic_average", criterion="given", weights=(0.5, 0.5)),
+    RuleChoice.of("geometric_average", criterion="given", weights=(0.5, 0.5)),
 )
 
 

@@ -10,8 +10,6 @@ import numpy as np
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.linalg import Array
-from track_fusion.rules.mixture_average import MixtureAverageParams
-from track_fusion.rules.mixture_hybrid import MixtureHybridParams
 from track_fusion.scenarios.li2019 import PAPER
 from track_fusion.scenarios.li2019.common import (
     exact_geometric,
@@ -39,8 +37,8 @@ STEP = float(X[1] - X[0])
 #: Beyond this distance from the targets and from the isolated component, two of its standard deviations, is the tail.
 TAIL = 2.0 * np.sqrt(200.0)
 
-AVERAGE = RuleChoice("mixture_average", MixtureAverageParams(max_components=0))
-HYBRID = RuleChoice("mixture_hybrid", MixtureHybridParams(max_components=0))
+AVERAGE = RuleChoice.of("mixture_average", max_components=0)
+HYBRID = RuleChoice.of("mixture_hybrid", max_components=0)
 AA, GA, EXACT = "given-mixture_average", "given-mixture_hybrid", "given-mixture_hybrid@exact"
 
 

@@ -14,8 +14,6 @@ from track_fusion.densities.mixture.mixture import Mixture
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.random_streams import stream
-from track_fusion.rules.mixture_average import MixtureAverageParams
-from track_fusion.rules.mixture_hybrid import MixtureHybridParams
 from track_fusion.scenarios.li2019 import PAPER
 from track_fusion.scenarios.li2019.common import (
     exact_geometric,
@@ -41,9 +39,9 @@ BETWEEN = np.array([20.0, 30.0, 40.0])
 #: Where intensities that are no mixtures are evaluated: all mass inside, the edges of NEAR and FAR between two points.
 X = np.arange(-60.0, 280.0, 0.5) + 0.25
 
-AVERAGE = RuleChoice("mixture_average", MixtureAverageParams(max_components=0))
+AVERAGE = RuleChoice.of("mixture_average", max_components=0)
 #: Twenty components carry the masses to one part in a thousand, at a hundredth of the time that a hundred take.
-HYBRID = RuleChoice("mixture_hybrid", MixtureHybridParams(max_components=20))
+HYBRID = RuleChoice.of("mixture_hybrid", max_components=20)
 AA, GA, EXACT = "given-mixture_average", "given-mixture_hybrid", "given-mixture_hybrid@exact"
 
 

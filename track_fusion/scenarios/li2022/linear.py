@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from track_fusion.filters.kalman import Kalman
@@ -15,19 +17,16 @@ from track_fusion.scenarios.li2022.claims import (
     CREDIBILITY,
     INTERSECTION,
     POSITION,
+    RULES,
     VELOCITY,
     balance_claims,
     named,
     union_claims,
     weight_claims,
 )
-from track_fusion.scenarios.li2022.claims import (
-    RULES as ROWS,
-)
 from track_fusion.study.claim import Claim, ascending
-from track_fusion.study.one_target import RULE_CHOICES, Row, fused_row, gaussian_rows, same_filters, sir_rows
+from track_fusion.study.one_target import RULE_CHOICES, fused_row, gaussian_rows, same_filters, sir_rows
 from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
-from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.study.scenario import Printed, Scenario
 from track_fusion.study.scene import Tracking
 from track_fusion.tracks import planar_layout
@@ -65,18 +64,11 @@ TRACKING = Tracking(
 )
 
 
-def kalman_row(choice: RuleChoice) -> Row:
-    """Two Kalman filters fused by any rule."""
-    return fused_row(TRACKING, KF, choice)
-
-
-def kalman_rows() -> dict[str, Row]:
-    """Rows of Table I by Kalman filters."""
-    return gaussian_rows("kf", TRACKING, KF, RULE_CHOICES)
-
-
-STUDY = OneTargetStudy(TRACKING, QUANTITIES, kalman_rows() | sir_rows(TRACKING, SIR, RULE_CHOICES), ("kf", kalman_row))
-
+#: Rows of Table I by Kalman filters.
+KALMAN_ROWS = gaussian_rows("kf", TRACKING, KF, RULE_CHOICES)
+STUDY = OneTargetStudy(
+    TRACKING, QUANTITIES, KALMAN_ROWS | sir_rows(TRACKING, SIR, RULE_CHOICES), ("kf", partial(fused_row, TRACKING, KF))
+)
 
 #: Two rows are close to each other if all of Table I that the text calls so are: SIR-CI is 6 % above SIR-AA.
 CLOSE = 0.06
@@ -89,13 +81,13 @@ def _claims() -> tuple[Claim, ...]:
             "KF with both sensors' measurements (IC) is the best row of all",
             "IV-A",
             f"kf-ic/{POSITION}",
-            [n for one in ("kf", "sir") for n in named(POSITION, one, *ROWS) if n != f"kf-ic/{POSITION}"],
+            [n for one in ("kf", "sir") for n in named(POSITION, one, *RULES) if n != f"kf-ic/{POSITION}"],
         ),
         Claim.each(
             "the Kalman filter does better than the particle filter with every rule and alone",
             "IV-A",
-            named(POSITION, "kf", *ROWS),
-            named(POSITION, "sir", *ROWS),
+            named(POSITION, "kf", *RULES),
+            named(POSITION, "sir", *RULES),
             ascending,
         ),
         Claim.near(

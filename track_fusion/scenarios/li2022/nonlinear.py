@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from track_fusion.filters.cubature import Cubature
@@ -21,9 +23,8 @@ from track_fusion.scenarios.li2022.claims import (
     weight_claims,
 )
 from track_fusion.study.claim import Claim, ascending
-from track_fusion.study.one_target import RULE_CHOICES, Row, fused_row, gaussian_rows, same_filters, sir_rows
+from track_fusion.study.one_target import RULE_CHOICES, fused_row, gaussian_rows, same_filters, sir_rows
 from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
-from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.study.scenario import Printed, Scenario
 from track_fusion.study.scene import Tracking
 from track_fusion.tracks import StateLayout
@@ -69,20 +70,8 @@ TRACKING = Tracking(
 )
 
 
-def cubature_row(choice: RuleChoice) -> Row:
-    """Two cubature Kalman filters fused by any rule."""
-    return fused_row(TRACKING, CKF, choice)
-
-
-def cubature_rows() -> dict[str, Row]:
-    """Rows of Table II by cubature Kalman filters."""
-    return gaussian_rows("ckf", TRACKING, CKF, RULE_CHOICES)
-
-
-STUDY = OneTargetStudy(
-    TRACKING, QUANTITIES, cubature_rows() | sir_rows(TRACKING, SIR, RULE_CHOICES), ("ckf", cubature_row)
-)
-
+ROWS = gaussian_rows("ckf", TRACKING, CKF, RULE_CHOICES) | sir_rows(TRACKING, SIR, RULE_CHOICES)
+STUDY = OneTargetStudy(TRACKING, QUANTITIES, ROWS, ("ckf", partial(fused_row, TRACKING, CKF)))
 
 #: Two rows are close to each other if all of Table II that the text calls so are: SIR-CI is 7 % above CKF-IC.
 CLOSE = 0.08

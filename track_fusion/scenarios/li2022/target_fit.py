@@ -13,7 +13,6 @@ from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.rules import FusedTracks, SourceTracks
-from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.scenarios.li2022 import PAPER
 from track_fusion.study.chart import Chart, Series, Style
 from track_fusion.study.claim import Claim, ascending, within
@@ -34,10 +33,10 @@ POINTS = np.linspace(LOW, HIGH, 20001)[:, None]
 DRAWN = slice(4000, 17001, 40)
 
 RULE_CHOICES = (
-    RuleChoice("arithmetic_average", ArithmeticAverageParams(criterion="target")),
-    RuleChoice("arithmetic_average", ArithmeticAverageParams(criterion="diversity"), "diversity"),
-    RuleChoice("arithmetic_average", ArithmeticAverageParams(criterion="uniform"), "uniform"),
-    RuleChoice("arithmetic_average", ArithmeticAverageParams(criterion="target_mixture"), "target_mixture"),
+    RuleChoice.of("arithmetic_average", criterion="target"),
+    RuleChoice.of("arithmetic_average", "diversity", criterion="diversity"),
+    RuleChoice.of("arithmetic_average", "uniform", criterion="uniform"),
+    RuleChoice.of("arithmetic_average", "target_mixture", criterion="target_mixture"),
 )
 #: The best fit of the merged Gaussian (39), the best of the mixture itself (33), and other weights.
 BEST, FITTED, OTHERS = RULE_CHOICES[0], RULE_CHOICES[3], RULE_CHOICES[1:3]

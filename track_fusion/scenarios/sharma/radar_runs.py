@@ -17,10 +17,6 @@ from track_fusion.models.geodetic import LocalFrame
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.rules import RULES
-from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
-from track_fusion.rules.harmonic_mean import HarmonicMeanParams
-from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
-from track_fusion.rules.naive import NaiveParams
 from track_fusion.scenarios.sharma.surveillance import Courses, Radar, Surveillance
 from track_fusion.study.rows import Outcomes, Progress
 from track_fusion.study.rule_choice import RuleChoice
@@ -79,10 +75,10 @@ TRACKER = PdaTrackerParams(
 )
 MANAGER = TrackManagerParams(confirmation_threshold=(2, 3), deletion_threshold=(2, 2), max_coast_s=25.0)
 RULE_CHOICES = (
-    RuleChoice("covariance_intersection", CovarianceIntersectionParams()),
-    RuleChoice("inverse_covariance_intersection", InverseCovarianceIntersectionParams()),
-    RuleChoice("harmonic_mean", HarmonicMeanParams(combine="fold")),
-    RuleChoice("naive", NaiveParams()),
+    RuleChoice.of("covariance_intersection"),
+    RuleChoice.of("inverse_covariance_intersection"),
+    RuleChoice.of("harmonic_mean", combine="fold"),
+    RuleChoice.of("naive"),
 )
 FUSION_TIMES_S: Array = SCAN_S * np.arange(FUSION_SCANS, STEPS + 1, FUSION_SCANS, dtype=np.float64)
 

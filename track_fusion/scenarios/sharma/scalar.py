@@ -12,9 +12,6 @@ from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate, armse
 from track_fusion.random_streams import stream
 from track_fusion.rules import RULES
-from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
-from track_fusion.rules.harmonic_mean import HarmonicMeanParams
-from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
 from track_fusion.scenarios.sharma import PAPER
 from track_fusion.study.chart import Chart, Series, bars
 from track_fusion.study.claim import Claim, within
@@ -40,9 +37,9 @@ class Setting(NamedTuple):
 #: The paper gives neither noise variances nor the correlation.
 SETTINGS = tuple(Setting(q, rho) for q in (0.1, 1.0, 10.0) for rho in (-0.5, 0.0, 0.5))
 RULE_CHOICES = (
-    RuleChoice("covariance_intersection", CovarianceIntersectionParams()),
-    RuleChoice("inverse_covariance_intersection", InverseCovarianceIntersectionParams()),
-    RuleChoice("harmonic_mean", HarmonicMeanParams()),
+    RuleChoice.of("covariance_intersection"),
+    RuleChoice.of("inverse_covariance_intersection"),
+    RuleChoice.of("harmonic_mean"),
 )
 
 
@@ -59,7 +56,7 @@ class Pair:
 PAIRS = {
     "given-harmonic_mean@ratio10_rho0_9": Pair((1.0, 10.0), 0.9, RULE_CHOICES[-1]),
     "given-harmonic_mean@half_ratio10_rho0_99": Pair(
-        (1.0, 10.0), 0.99, RuleChoice("harmonic_mean", HarmonicMeanParams(criterion="given", weights=(0.5, 0.5)))
+        (1.0, 10.0), 0.99, RuleChoice.of("harmonic_mean", criterion="given", weights=(0.5, 0.5))
     ),
 }
 #: Pairs drawn in each run.
