@@ -145,54 +145,33 @@ def _component_chart() -> Chart:
 
 
 CLAIMS = (
-    Claim(
-        "The weights of the geometric average sum to the average of the sources' sums.",
-        "5.1",
-        (f"{GA}/expected_targets_1", "given-alone@gm1/expected_targets_1", "given-alone@gm2/expected_targets_1"),
-        lambda fused, first, second: within(fused - 0.5 * (first + second), 1e-6),
-        by_construction="its weights are scaled to that sum",
-    ),
+    Claim("The weights of the geometric average sum to the average of the sources' sums.", "5.1",
+          (f"{GA}/expected_targets_1", "given-alone@gm1/expected_targets_1", "given-alone@gm2/expected_targets_1"),
+          lambda fused, first, second: within(fused - 0.5 * (first + second), 1e-6),
+          by_construction="its weights are scaled to that sum"),
     *(
-        Claim.order(
-            f"The geometric average has the higher peak at target {k}.",
-            "Remark 9",
-            f"{AA}/peak_target{k}_1",
-            f"{GA}/peak_target{k}_1",
-        )
+        Claim.order(f"The geometric average has the higher peak at target {k}.", "Remark 9",
+                    f"{AA}/peak_target{k}_1", f"{GA}/peak_target{k}_1")
         for k in (1, 2)
     ),
     *(
-        Claim.order(
-            f"The heaviest component of the geometric average at target {k} outweighs each of the arithmetic.",
-            "Remark 9",
-            f"{AA}/component{theirs}_weight_1",
-            f"{GA}/component{ours}_weight_1",
-        )
+        Claim.order(f"The heaviest component of the geometric average at target {k} outweighs each of the arithmetic.",
+                    "Remark 9", f"{AA}/component{theirs}_weight_1", f"{GA}/component{ours}_weight_1")
         for k, theirs, ours in ((1, 2, 1), (2, 4, 5))
     ),
     *(
-        Claim.order(
-            f"Without the approximation (49) the geometric average has the higher peak at target {k}.",
-            "Remark 9",
-            f"{AA}/peak_target{k}_1",
-            f"{EXACT}/peak_target{k}_1",
-        )
+        Claim.order(f"Without the approximation (49) the geometric average has the higher peak at target {k}.",
+                    "Remark 9", f"{AA}/peak_target{k}_1", f"{EXACT}/peak_target{k}_1")
         for k in (1, 2)
     ),
     Claim.order("The geometric average has lighter tails.", "Remark 9", f"{GA}/tail_mass_1", f"{AA}/tail_mass_1"),
-    Claim(
-        "The isolated component survives in the arithmetic average, a peak of less weight.",
-        "Remark 10",
-        (f"{AA}/peaks_1", f"{AA}/component5_weight_1"),
-        lambda peaks, weight: [*within(peaks - 3.0, 0.5), weight, PARTS.weight[0, 2] - weight],
-    ),
-    Claim(
-        "It almost vanishes from the geometric average: no peak is left of it.",
-        "Remark 10",
-        (f"{GA}/peaks_1", f"{GA}/isolated_1", f"{AA}/isolated_1"),
-        lambda peaks, geometric, arithmetic: [*within(peaks - 2.0, 0.5), arithmetic - geometric],
-    ),
-)
+    Claim("The isolated component survives in the arithmetic average, a peak of less weight.", "Remark 10",
+          (f"{AA}/peaks_1", f"{AA}/component5_weight_1"),
+          lambda peaks, weight: [*within(peaks - 3.0, 0.5), weight, PARTS.weight[0, 2] - weight]),
+    Claim("It almost vanishes from the geometric average: no peak is left of it.", "Remark 10",
+          (f"{GA}/peaks_1", f"{GA}/isolated_1", f"{AA}/isolated_1"),
+          lambda peaks, geometric, arithmetic: [*within(peaks - 2.0, 0.5), arithmetic - geometric]),
+)  # fmt: skip
 
 SCENARIO = Scenario(
     key="li2019-mixture",

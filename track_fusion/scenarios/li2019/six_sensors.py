@@ -249,12 +249,8 @@ def _trial_chart(rows: Mapping[str, str]) -> Chart:
 
 
 CLAIMS = (
-    Claim.order(
-        "The geometric average loses targets that the arithmetic average keeps.",
-        "5.2, Fig. 8",
-        f"{AA}/lost_targets_1",
-        f"{GA}/lost_targets_1",
-    ),
+    Claim.order("The geometric average loses targets that the arithmetic average keeps.", "5.2, Fig. 8",
+                f"{AA}/lost_targets_1", f"{GA}/lost_targets_1"),
     Claim(
         "It mixes the targets at 20 and 40 (judged: in most trials), and the arithmetic average does not (in less than "
         "one of twenty).",
@@ -262,32 +258,18 @@ CLAIMS = (
         (f"{GA}/mixed_share_1", f"{AA}/mixed_share_1"),
         lambda geometric, arithmetic: [geometric - 0.5, 0.05 - arithmetic],
     ),
-    Claim.order(
-        "The more sensors, the more targets the geometric average loses.",
-        "5.2; 6, PHD fusion, conclusion 2",
-        *(f"{GA}@sensors{k}/lost_targets_1" for k in range(2, SENSORS)),
-        f"{GA}/lost_targets_1",
-    ),
+    Claim.order("The more sensors, the more targets the geometric average loses.", "5.2; 6, PHD fusion, conclusion 2",
+                *(f"{GA}@sensors{k}/lost_targets_1" for k in range(2, SENSORS)), f"{GA}/lost_targets_1"),
     Claim.above(
         "A target that one sensor misses is lost from the geometric average, whatever the other five see (judged: in "
-        "more than nine of ten cases).",
-        "5.2",
-        0.9,
-        f"{GA}/lost_missed_by_1_share_1",
+        "more than nine of ten cases).", "5.2",
+        0.9, f"{GA}/lost_missed_by_1_share_1",
     ),
-    Claim.order(
-        "The geometric average suppresses false alarms better: less mass far from all targets.",
-        "6, PHD fusion, conclusion 2",
-        f"{GA}/far_mass_1",
-        f"{AA}/far_mass_1",
-    ),
-    Claim.order(
-        "Without the approximation (49) the geometric average loses fewer targets.",
-        "5.2",
-        f"{EXACT}/lost_targets_1",
-        f"{GA}/lost_targets_1",
-    ),
-)
+    Claim.order("The geometric average suppresses false alarms better: less mass far from all targets.",
+                "6, PHD fusion, conclusion 2", f"{GA}/far_mass_1", f"{AA}/far_mass_1"),
+    Claim.order("Without the approximation (49) the geometric average loses fewer targets.", "5.2",
+                f"{EXACT}/lost_targets_1", f"{GA}/lost_targets_1"),
+)  # fmt: skip
 
 SCENARIO = Scenario(
     key="li2019-six-sensors",

@@ -47,13 +47,10 @@ def union_claims(one: str, source: str) -> tuple[Claim, ...]:
         claims += [
             Claim.greatest(f"{name} is worse than every row but naive fusion", source, own, rest),
             Claim.order(f"{name} is worse than the arithmetic average", source, *named(POSITION, one, AVERAGE), own),
-            Claim(
-                f"{name} is over-conservative: credibility above 1, the arithmetic average's and the intersection's",
-                source,
-                named(CREDIBILITY, one, union, AVERAGE, INTERSECTION),
-                lambda first, *others: [first - 1.0, *(first - other for other in others)],
-            ),
-        ]
+            Claim(f"{name} is over-conservative: credibility above 1, the arithmetic average's and the intersection's",
+                  source, named(CREDIBILITY, one, union, AVERAGE, INTERSECTION),
+                  lambda first, *others: [first - 1.0, *(first - other for other in others)]),
+        ]  # fmt: skip
     return tuple(claims)
 
 
@@ -63,27 +60,15 @@ def balance_claims(one: str, source: str) -> tuple[Claim, ...]:
     return (
         Claim.below(
             f"{name} with naive fusion is inconsistent: it claims less than a quarter of its mean squared error",
-            source,
-            0.25,
-            *named(CREDIBILITY, one, "naive"),
+            source, 0.25, *named(CREDIBILITY, one, "naive"),
         ),
-        Claim.above(
-            f"{name} with the arithmetic average or the intersection is conservative (credibility above .95)",
-            source,
-            0.95,
-            *named(CREDIBILITY, one, AVERAGE, INTERSECTION),
-        ),
-        Claim.order(
-            f"{name}: chain (13) in what is claimed of the position, naive < sensor 1 < average < union",
-            "II-B, (13)",
-            *named(CLAIMED, one, "naive", "alone", AVERAGE, UNION),
-        ),
-        Claim.order(
-            f"{name}: chain (19) in what is claimed of the position, naive < intersection < average",
-            "II-C, (19)",
-            *named(CLAIMED, one, "naive", INTERSECTION, AVERAGE),
-        ),
-    )
+        Claim.above(f"{name} with the arithmetic average or the intersection is conservative (credibility above .95)",
+                    source, 0.95, *named(CREDIBILITY, one, AVERAGE, INTERSECTION)),
+        Claim.order(f"{name}: chain (13) in what is claimed of the position, naive < sensor 1 < average < union",
+                    "II-B, (13)", *named(CLAIMED, one, "naive", "alone", AVERAGE, UNION)),
+        Claim.order(f"{name}: chain (19) in what is claimed of the position, naive < intersection < average",
+                    "II-C, (19)", *named(CLAIMED, one, "naive", INTERSECTION, AVERAGE)),
+    )  # fmt: skip
 
 
 def weight_claims(one: str, source: str) -> tuple[Claim, ...]:
@@ -91,10 +76,6 @@ def weight_claims(one: str, source: str) -> tuple[Claim, ...]:
     names = named(WEIGHT, one, AVERAGE), named("sensor_1_weight_sd_1", one, AVERAGE)
     return (
         Claim.above(f"{one.upper()}: the average gives sensor 1, the better one, more weight", source, 0.5, *names[0]),
-        Claim.below(
-            f"{one.upper()}: that weight varies little (standard deviation over runs below .05)",
-            source,
-            0.05,
-            *names[1],
-        ),
-    )
+        Claim.below(f"{one.upper()}: that weight varies little (standard deviation over runs below .05)", source,
+                    0.05, *names[1]),
+    )  # fmt: skip

@@ -205,26 +205,17 @@ def _claims() -> tuple[Claim, ...]:
     inverse, tolerant, _ = (f"given-{choice.name}" for choice in CHAIN)
     apart = [
         dataclasses.replace(
-            Claim.close(
-                f"the covariance by {row.partition('-')[2]} does not depend on how far apart the means are",
-                "II-C",
-                ROUNDING,
-                *(f"{row}/trace_case_{case}_m2" for case in SEPARATIONS),
-            ),
+            Claim.close(f"the covariance by {row.partition('-')[2]} does not depend on how far apart the means are",
+                        "II-C", ROUNDING, *(f"{row}/trace_case_{case}_m2" for case in SEPARATIONS)),
             by_construction="the rule takes it from the covariances alone",
         )
         for row in (geometric, intersection)
-    ]
+    ]  # fmt: skip
     shapes = [
-        Claim.near(
-            f"({case}) the mixture before merging has {words}",
-            "II-E, Fig. 1",
-            count,
-            0.5,
-            f"{MIXTURE}/modes_case_{case}_1",
-        )
+        Claim.near(f"({case}) the mixture before merging has {words}", "II-E, Fig. 1",
+                   count, 0.5, f"{MIXTURE}/modes_case_{case}_1")
         for case, count, words in (("a", 1, "one mode"), ("c", 2, "two modes"), ("d", 2, "two modes"))
-    ]
+    ]  # fmt: skip
     return (
         _in_every_case(
             "chain (13), naive < min P <= CU min <= AA <= CU max",

@@ -77,51 +77,31 @@ _OTHERS = ("alone", "ic", AVERAGE, INTERSECTION, "covariance_union")
 
 def _claims() -> tuple[Claim, ...]:
     claims = [
-        Claim.least(
-            "KF with both sensors' measurements (IC) is the best row of all",
-            "IV-A",
-            f"kf-ic/{POSITION}",
-            [n for one in ("kf", "sir") for n in named(POSITION, one, *RULES) if n != f"kf-ic/{POSITION}"],
-        ),
-        Claim.each(
-            "the Kalman filter does better than the particle filter with every rule and alone",
-            "IV-A",
-            named(POSITION, "kf", *RULES),
-            named(POSITION, "sir", *RULES),
-            ascending,
-        ),
-        Claim.near(
-            "KF-IC is Bayes-optimal: what it claims is its mean squared error (credibility within 5 % of 1)",
-            "IV",
-            1.0,
-            0.05,
-            *named(CREDIBILITY, "kf", "ic"),
-        ),
-    ]
+        Claim.least("KF with both sensors' measurements (IC) is the best row of all", "IV-A",
+                    f"kf-ic/{POSITION}",
+                    [n for one in ("kf", "sir") for n in named(POSITION, one, *RULES) if n != f"kf-ic/{POSITION}"]),
+        Claim.each("the Kalman filter does better than the particle filter with every rule and alone", "IV-A",
+                   named(POSITION, "kf", *RULES), named(POSITION, "sir", *RULES), ascending),
+        Claim.near("KF-IC is Bayes-optimal: what it claims is its mean squared error (credibility within 5 % of 1)",
+                   "IV", 1.0, 0.05, *named(CREDIBILITY, "kf", "ic")),
+    ]  # fmt: skip
     for one in ("kf", "sir"):
         name = one.upper()
         ic, average, intersection = named(POSITION, one, "ic", AVERAGE, INTERSECTION)
         claims += [
-            Claim.greatest(
-                f"{name} with naive fusion is the worst row, worse than sensor 1 alone",
-                "IV-A",
-                f"{one}-naive/{POSITION}",
-                named(POSITION, one, *_OTHERS),
-            ),
+            Claim.greatest(f"{name} with naive fusion is the worst row, worse than sensor 1 alone", "IV-A",
+                           f"{one}-naive/{POSITION}", named(POSITION, one, *_OTHERS)),
             Claim.close(
                 f"{name}: average and intersection are similar (within 6 %)", "IV-A", CLOSE, average, intersection
             ),
             Claim.close(f"{name}: the average is close to IC (within 6 %)", "IV-A", CLOSE, ic, average),
             Claim.close(f"{name}: the intersection is close to IC (within 6 %)", "IV-A", CLOSE, ic, intersection),
             Claim.order(f"{name}: the average beats the intersection in position", "Table I", average, intersection),
-            Claim.order(
-                f"{name}: the intersection beats the average in velocity",
-                "Table I",
-                *named(VELOCITY, one, INTERSECTION, AVERAGE),
-            ),
+            Claim.order(f"{name}: the intersection beats the average in velocity", "Table I",
+                        *named(VELOCITY, one, INTERSECTION, AVERAGE)),
             *union_claims(one, "IV-A"),
             *balance_claims(one, "IV-A"),
-        ]
+        ]  # fmt: skip
     return (*claims, *weight_claims("kf", "IV-A, Fig. 6"))
 
 

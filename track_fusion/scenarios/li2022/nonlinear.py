@@ -85,62 +85,40 @@ def _claims() -> tuple[Claim, ...]:
     claims = [
         Claim.order(
             "SIR with both sensors' measurements (IC) is worse than CKF-IC, and even than SIR with covariance union",
-            "IV-B",
-            f"ckf-ic/{POSITION}",
-            f"sir-{UNION}/{POSITION}",
-            f"sir-ic/{POSITION}",
+            "IV-B", f"ckf-ic/{POSITION}", f"sir-{UNION}/{POSITION}", f"sir-ic/{POSITION}",
         ),
-        Claim.each(
-            "the particle filter does better than the cubature filter with every rule and alone, except IC",
-            "IV-B",
-            named(POSITION, "sir", *but_ic),
-            named(POSITION, "ckf", *but_ic),
-            ascending,
-        ),
+        Claim.each("the particle filter does better than the cubature filter with every rule and alone, except IC",
+                   "IV-B", named(POSITION, "sir", *but_ic), named(POSITION, "ckf", *but_ic), ascending),
         Claim.order("the weight on sensor 1 falls from the first step to the last", "IV-B, Fig. 11", *last, *first),
         *weight_claims("ckf", "IV-B, Fig. 11"),
-    ]
+    ]  # fmt: skip
     for rule in (AVERAGE, INTERSECTION):
         names = [f"{one}-{rule}/{POSITION}" for one in ("ckf", "sir")]
         claims.append(
             Claim.close(f"particles do not degenerate under {rule}: SIR is within 8 % of CKF", "IV-B", CLOSE, *names)
-        )
+        )  # fmt: skip
     for one in ("ckf", "sir"):
         name, naive = one.upper(), f"{one}-naive/{POSITION}"
         best = named(POSITION, one, AVERAGE, INTERSECTION)
         claims += [
-            Claim.greatest(
-                f"{name} with naive fusion loses the target: three times the error of every other row",
-                "IV-B, Fig. 7",
-                naive,
-                named(POSITION, one, "alone", "ic", AVERAGE, INTERSECTION, UNION),
-                LOST,
-            ),
+            Claim.greatest(f"{name} with naive fusion loses the target: three times the error of every other row",
+                           "IV-B, Fig. 7", naive, named(POSITION, one, "alone", "ic", AVERAGE, INTERSECTION, UNION),
+                           LOST),
             Claim.order(
                 f"{name} with covariance union is worse than with naive fusion (as the text has it, against Table II)",
-                "IV-B",
-                naive,
-                f"{one}-{UNION}/{POSITION}",
+                "IV-B", naive, f"{one}-{UNION}/{POSITION}",
             ),
-            Claim(
-                f"{name}: average and intersection are better than naive fusion and union",
-                "IV-B",
-                (*best, naive, f"{one}-{UNION}/{POSITION}"),
-                lambda *errors: [worse - better for better in errors[:2] for worse in errors[2:]],
-            ),
+            Claim(f"{name}: average and intersection are better than naive fusion and union", "IV-B",
+                  (*best, naive, f"{one}-{UNION}/{POSITION}"),
+                  lambda *errors: [worse - better for better in errors[:2] for worse in errors[2:]]),
             Claim.close(
                 f"{name}: the average is close to CKF-IC (within 8 %)", "IV-B", CLOSE, f"ckf-ic/{POSITION}", best[0]
             ),
-            Claim.close(
-                f"{name}: the intersection is close to CKF-IC (within 8 %)",
-                "IV-B",
-                CLOSE,
-                f"ckf-ic/{POSITION}",
-                best[1],
-            ),
+            Claim.close(f"{name}: the intersection is close to CKF-IC (within 8 %)", "IV-B",
+                        CLOSE, f"ckf-ic/{POSITION}", best[1]),
             *union_claims(one, "IV-B"),
             *balance_claims(one, "IV-B"),
-        ]
+        ]  # fmt: skip
     return tuple(claims)
 
 

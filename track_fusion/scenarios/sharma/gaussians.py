@@ -171,10 +171,8 @@ SCENARIO = Scenario(
             "The covariance shrinks from GMD-S to HMD-S to HMD-GA.", "5.2, Fig. 1a",
             "harmonic_mean", "harmonic_mean@sampled", "geometric_mean_sampling",
         ),
-        Claim.least(
-            "HMD-GA claims less than ICI, HMD-S and CI at the same weights.", "6, Fig. 1a, A",
-            f"given-{HMD_GA.name}/determinant_1", [f"given-{c.name}/determinant_1" for c in (ICI, HMD_S, CI)],
-        ),
+        Claim.least("HMD-GA claims less than ICI, HMD-S and CI at the same weights.", "6, Fig. 1a, A",
+                    f"given-{HMD_GA.name}/determinant_1", [f"given-{c.name}/determinant_1" for c in (ICI, HMD_S, CI)]),
         _order(
             "HMD-GA is tighter than ICI when each finds its own weights: (75)-(76).", "7",
             "harmonic_mean@own_weights", "inverse_covariance_intersection@own_weights",

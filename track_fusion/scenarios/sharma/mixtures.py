@@ -83,20 +83,15 @@ SCENARIO = Scenario(
     figures=partial(shared.figures, ROWS),
     charts=charts,
     claims=(
-        Claim.order(
-            "The uncertainty of HMD-S is less than that of GMD-S: by samples.",
-            "5.2, Fig. 2",
-            "given-harmonic_mean@sampled/determinant_1",
-            "given-geometric_mean_sampling/determinant_1",
-        ),
+        Claim.order("The uncertainty of HMD-S is less than that of GMD-S: by samples.", "5.2, Fig. 2",
+                    "given-harmonic_mean@sampled/determinant_1", "given-geometric_mean_sampling/determinant_1"),
         Claim.order(
             "The uncertainty of the harmonic mean is less than that of the geometric: the densities themselves.",
-            "5.2, Fig. 2",
-            "given-harmonic_mean@grid/determinant_1",
+            "5.2, Fig. 2", "given-harmonic_mean@grid/determinant_1",
             "given-geometric_mean_sampling@grid/determinant_1",
         ),
     ),
     piece=50,
     rules=RULE_CHOICES,
     scores=PAIR.scores,
-)
+)  # fmt: skip

@@ -81,14 +81,10 @@ SCENARIO = Scenario(
     charts=partial(shared.charts, {"": "S5"}),
     claims=(
         *common_claims("6.3, Fig. 7"),
-        Claim(
-            "The actual error of HMD-GA almost equals that of centralised fusion.", "6.3, Fig. 7",
-            ("kf-centralised/sample_trace_1", "kf-harmonic_mean/sample_trace_1"), _almost,
-        ),
-        Claim(
-            "The covariance that HMD-GA reports almost equals that of centralised fusion.", "6.3, Fig. 7",
-            ("kf-centralised/reported_trace_1", "kf-harmonic_mean/reported_trace_1"), _almost,
-        ),
+        Claim("The actual error of HMD-GA almost equals that of centralised fusion.", "6.3, Fig. 7",
+              ("kf-centralised/sample_trace_1", "kf-harmonic_mean/sample_trace_1"), _almost),
+        Claim("The covariance that HMD-GA reports almost equals that of centralised fusion.", "6.3, Fig. 7",
+              ("kf-centralised/reported_trace_1", "kf-harmonic_mean/reported_trace_1"), _almost),
     ),
     piece=2500,
     rules=RULE_CHOICES,
