@@ -23,12 +23,7 @@ TIE = 1e-9
 CHUNK_NUMBERS = 2**16
 
 
-@dataclasses.dataclass(frozen=True)
-class QuasiMinimalManhattanParams(EllipticalParams):
-    """The family of the tracks."""
-
-
-def fuse(tracks: SourceTracks, params: QuasiMinimalManhattanParams) -> FusedTracks:
+def fuse(tracks: SourceTracks, params: EllipticalParams) -> FusedTracks:
     """Fuse K elliptical tracks by the intersection whose minimal Manhattan distances to them are least.
 
     The weights minimise the sum of the squares of the distances (28) from each track to the fused one. Promises
@@ -37,7 +32,7 @@ def fuse(tracks: SourceTracks, params: QuasiMinimalManhattanParams) -> FusedTrac
     Parameters
     ----------
     tracks : SourceTracks    mean (..., K, n), cov (..., K, n, n), dof (..., K) or None
-    params : QuasiMinimalManhattanParams
+    params : EllipticalParams
 
     Returns
     -------
@@ -156,7 +151,7 @@ RULE = Rule(
     key="quasi_minimal_manhattan",
     title="Quasi-minimal Manhattan distance",
     fuse=fuse,
-    params=QuasiMinimalManhattanParams,
+    params=EllipticalParams,
     family="elliptical",
     arity="n_ary",
     guarantee="none",
