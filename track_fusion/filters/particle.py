@@ -181,13 +181,7 @@ class Sir:
         return self._drawn(*density.moments, state.rng)
 
     def predict(self, state: SirState, transition: Transition) -> SirState:
-        """Move every particle, x' = f(x) + w, w drawn from N(0, Q).
-
-        Parameters
-        ----------
-        state : SirState    (..., N)
-        transition : Transition
-        """
+        """Move every particle (..., N), x' = f(x) + w, w drawn from N(0, Q)."""
         if (state.log_weight != state.log_weight[..., :1]).any():
             state = self._resampled(state, state.rng)
         points = state.points
@@ -196,13 +190,7 @@ class Sir:
         return dataclasses.replace(state, points=moved)
 
     def update(self, state: SirState, z: Array, sensor: Sensor) -> tuple[SirState, Evidence]:
-        """Weigh the particles by their likelihood of z = h(x) + v.
-
-        Parameters
-        ----------
-        state : SirState    (..., N)
-        z : (..., m)
-        sensor : Sensor
+        """Weigh the particles (..., N) by their likelihood of z = h(x) + v, (..., m).
 
         Notes    Several sensors are used one after the other, which multiplies their likelihoods, Li 2022 (46).
                  Weights cannot all vanish: they are kept by their logarithms.

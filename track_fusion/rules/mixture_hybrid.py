@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 from track_fusion.rules.base import Example, FusedTracks, Mixture, Rule, SourceTracks
-from track_fusion.rules.shared.mixtures import (
-    AverageParams,
-    fused_tracks,
-    geometric_average,
-    source_mixtures,
-)
+from track_fusion.rules.shared.mixtures import AverageParams, fused_tracks, geometric_average, source_mixtures
 from track_fusion.rules.shared.weights import GIVEN
 
 

@@ -11,12 +11,7 @@ from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.linalg import Array
 from track_fusion.scenarios.li2019 import PAPER
-from track_fusion.scenarios.li2019.common import (
-    exact_geometric,
-    fused_intensity,
-    intensity,
-    scalar_mixture,
-)
+from track_fusion.scenarios.li2019.common import exact_geometric, fused_intensity, intensity, scalar_mixture
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.claim import Claim, within
 from track_fusion.study.rows import Outcomes, Progress, exact_figures, exact_rows

@@ -15,12 +15,7 @@ from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.random_streams import stream
 from track_fusion.scenarios.li2019 import PAPER
-from track_fusion.scenarios.li2019.common import (
-    exact_geometric,
-    fused_intensity,
-    intensity,
-    scalar_mixture,
-)
+from track_fusion.scenarios.li2019.common import exact_geometric, fused_intensity, intensity, scalar_mixture
 from track_fusion.study.chart import Chart, Series, estimates
 from track_fusion.study.claim import Claim
 from track_fusion.study.rows import Outcomes, Progress, chosen, row_by_row
