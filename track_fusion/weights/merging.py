@@ -30,13 +30,12 @@ def merging_weights(mean: Array, cov: Array, linear: Array | None = None) -> Sol
 
     Parameters
     ----------
-    mean : (B, K, n)
-    cov : (B, K, n, n)
+    mean, cov
     linear : (B, K) or None    l; None = log det P_i
 
     Returns
     -------
-    Solution    weights (B, K); uniform where all tracks are equal
+    Solution    uniform where all tracks are equal
     """
     if mean.shape[1] == 1:
         return Solution.known(np.ones(mean.shape[:2]))
@@ -139,15 +138,6 @@ def _gradient_hessian(mean: Array, cov: Array, linear: Array | None) -> Gradient
 
 def merging_weights_by_trace(mean: Array, cov: Array) -> Solution:
     """Minimise the trace of the inverse of P_AA(w), of a flat batch: (77) of Sharma by the trace, for K tracks.
-
-    Parameters
-    ----------
-    mean : (B, K, n)
-    cov : (B, K, n, n)
-
-    Returns
-    -------
-    Solution    weights (B, K)
 
     Notes         P_AA is concave in the weights, and the trace of an inverse convex and falling: a convex program.
     """

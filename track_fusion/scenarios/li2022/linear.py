@@ -11,20 +11,7 @@ from track_fusion.filters.particle import SirParams
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.scenarios.li2022 import PAPER
-from track_fusion.scenarios.li2022.claims import (
-    ASSUMPTIONS,
-    AVERAGE,
-    CREDIBILITY,
-    INTERSECTION,
-    POSITION,
-    RULES,
-    VELOCITY,
-    balance_claims,
-    named,
-    union_claims,
-    weight_claims,
-)
-from track_fusion.study.claim import Claim, ascending
+from track_fusion.scenarios.li2022.claims import ASSUMPTIONS, linear_claims
 from track_fusion.study.one_target import RULE_CHOICES, fused_row, gaussian_rows, same_filters, sir_rows
 from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
 from track_fusion.study.scenario import Printed, Scenario
@@ -70,41 +57,6 @@ STUDY = OneTargetStudy(
     TRACKING, QUANTITIES, KALMAN_ROWS | sir_rows(TRACKING, SIR, RULE_CHOICES), ("kf", partial(fused_row, TRACKING, KF))
 )
 
-#: Two rows are close to each other if all of Table I that the text calls so are: SIR-CI is 6 % above SIR-AA.
-CLOSE = 0.06
-_OTHERS = ("alone", "ic", AVERAGE, INTERSECTION, "covariance_union")
-
-
-def _claims() -> tuple[Claim, ...]:
-    claims = [
-        Claim.least("KF with both sensors' measurements (IC) is the best row of all", "IV-A",
-                    f"kf-ic/{POSITION}",
-                    [n for one in ("kf", "sir") for n in named(POSITION, one, *RULES) if n != f"kf-ic/{POSITION}"]),
-        Claim.each("the Kalman filter does better than the particle filter with every rule and alone", "IV-A",
-                   named(POSITION, "kf", *RULES), named(POSITION, "sir", *RULES), ascending),
-        Claim.near("KF-IC is Bayes-optimal: what it claims is its mean squared error (credibility within 5 % of 1)",
-                   "IV", 1.0, 0.05, *named(CREDIBILITY, "kf", "ic")),
-    ]  # fmt: skip
-    for one in ("kf", "sir"):
-        name = one.upper()
-        ic, average, intersection = named(POSITION, one, "ic", AVERAGE, INTERSECTION)
-        claims += [
-            Claim.greatest(f"{name} with naive fusion is the worst row, worse than sensor 1 alone", "IV-A",
-                           f"{one}-naive/{POSITION}", named(POSITION, one, *_OTHERS)),
-            Claim.close(
-                f"{name}: average and intersection are similar (within 6 %)", "IV-A", CLOSE, average, intersection
-            ),
-            Claim.close(f"{name}: the average is close to IC (within 6 %)", "IV-A", CLOSE, ic, average),
-            Claim.close(f"{name}: the intersection is close to IC (within 6 %)", "IV-A", CLOSE, ic, intersection),
-            Claim.order(f"{name}: the average beats the intersection in position", "Table I", average, intersection),
-            Claim.order(f"{name}: the intersection beats the average in velocity", "Table I",
-                        *named(VELOCITY, one, INTERSECTION, AVERAGE)),
-            *union_claims(one, "IV-A"),
-            *balance_claims(one, "IV-A"),
-        ]  # fmt: skip
-    return (*claims, *weight_claims("kf", "IV-A, Fig. 6"))
-
-
 SCENARIO = Scenario(
     key="li2022-linear",
     title="Two position sensors, one target, linear and Gaussian",
@@ -118,7 +70,7 @@ SCENARIO = Scenario(
     simulate=STUDY.simulate,
     figures=STUDY.figures,
     charts=STUDY.charts,
-    claims=_claims(),
+    claims=linear_claims(),
     piece=50,
     tracking=TRACKING,
     rules=RULE_CHOICES,
