@@ -15,12 +15,14 @@ from track_fusion.models.noise import Noise
 from track_fusion.params import ParameterError
 from track_fusion.random_streams import stream
 from track_fusion.rules import RULES, SourceTracks
-from track_fusion.scenarios import SCENARIOS, RuleChoice, judged_claims
+from track_fusion.scenarios import SCENARIOS
 from track_fusion.scenarios.chen2022 import dynamic, static
 from track_fusion.scenarios.chen2022 import dynamic_1 as case_1
 from track_fusion.scenarios.chen2022 import dynamic_2 as case_2
 from track_fusion.scenarios.chen2022.dynamic import DCI, FCI, GP, KLA, MHDP_E, MHDP_I, QMMHD
+from track_fusion.study.judgement import judged_claims
 from track_fusion.study.rows import Outcomes
+from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.study.scene import Tracking
 
 CASES = {"I": case_1.TRACKING, "II": case_2.TRACKING}

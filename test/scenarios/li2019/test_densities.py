@@ -9,8 +9,9 @@ from scipy.stats import norm
 
 from track_fusion.params import ParameterError
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
-from track_fusion.scenarios import RuleChoice, judged_claims, judged_figures
 from track_fusion.scenarios.li2019.densities import AA, GA, PAIRS, SCENARIO, THETA, WEIGHT
+from track_fusion.study.judgement import judged_claims, judged_figures
+from track_fusion.study.rule_choice import RuleChoice
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,10 @@ import pytest
 from scipy.integrate import trapezoid
 from scipy.stats import norm
 
-from track_fusion.scenarios import RuleChoice, judged_claims
 from track_fusion.scenarios.li2019.common import exact_geometric, intensity
 from track_fusion.scenarios.li2019.mixture import AA, EXACT, GA, PARTS, SCENARIO, X, fused_mixture
+from track_fusion.study.judgement import judged_claims
+from track_fusion.study.rule_choice import RuleChoice
 
 #: Weight, mean and variance of the hybrid average's components.
 ERRATA = [

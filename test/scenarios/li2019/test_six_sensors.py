@@ -8,7 +8,6 @@ from scipy.stats import norm
 
 from track_fusion.params import ParameterError
 from track_fusion.random_streams import stream
-from track_fusion.scenarios import RuleChoice, judged_claims
 from track_fusion.scenarios.li2019.common import exact_geometric, intensity, scalar_mixture
 from track_fusion.scenarios.li2019.six_sensors import (
     AA,
@@ -25,6 +24,8 @@ from track_fusion.scenarios.li2019.six_sensors import (
     scan,
     trials,
 )
+from track_fusion.study.judgement import judged_claims
+from track_fusion.study.rule_choice import RuleChoice
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,10 @@ from scipy.linalg import solve_discrete_are
 
 from track_fusion.params import ParameterError
 from track_fusion.rules import RULES, SourceTracks
-from track_fusion.scenarios import RuleChoice, judged_claims, judged_figures
 from track_fusion.scenarios.li2022.linear import KALMAN_ROWS, RULE_CHOICES, SCENARIO, STUDY, TRACKING
+from track_fusion.study.judgement import judged_claims, judged_figures
 from track_fusion.study.one_target_study import TRUTH
+from track_fusion.study.rule_choice import RuleChoice
 
 RUNS = 1000
 #: Converged values (position m, velocity m/s) and the spread of one 100-run table, by an independent implementation.

@@ -8,7 +8,6 @@ from scipy.stats import norm
 
 from track_fusion.params import ParameterError
 from track_fusion.rules import RULES
-from track_fusion.scenarios import RuleChoice, judged_claims, judged_figures
 from track_fusion.scenarios.li2022.target_fit import (
     BEST,
     DENSITIES,
@@ -23,6 +22,8 @@ from track_fusion.scenarios.li2022.target_fit import (
     fitted,
     mixture,
 )
+from track_fusion.study.judgement import judged_claims, judged_figures
+from track_fusion.study.rule_choice import RuleChoice
 
 MEANS, VARIANCES = DENSITIES.T
 

@@ -5,9 +5,9 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from track_fusion.params import ParameterError
-from track_fusion.scenarios import judged_claims
 from track_fusion.scenarios.sharma import gaussians as sharma_gaussians
 from track_fusion.scenarios.sharma import mixtures as sharma_mixtures
+from track_fusion.study.judgement import judged_claims
 from track_fusion.study.rule_choice import RuleChoice
 
 RUNS = 40

@@ -9,10 +9,10 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from track_fusion.params import ParameterError
-from track_fusion.scenarios import judged_claims
 from track_fusion.scenarios.sharma import network_1 as sharma_network_1
 from track_fusion.scenarios.sharma import network_2 as sharma_network_2
 from track_fusion.scenarios.sharma.network import RULE_CHOICES, figures
+from track_fusion.study.judgement import judged_claims
 from track_fusion.study.rule_choice import RuleChoice
 
 RUNS = 20_000

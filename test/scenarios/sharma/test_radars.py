@@ -8,7 +8,6 @@ from scipy.stats import chi2, kstest
 
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.params import ParameterError
-from track_fusion.scenarios import judged_claims
 from track_fusion.scenarios.sharma import radar_runs as sharma_radar_runs
 from track_fusion.scenarios.sharma.radar_runs import (
     CATEGORIES,
@@ -30,6 +29,7 @@ from track_fusion.scenarios.sharma.radar_runs import (
 )
 from track_fusion.scenarios.sharma.radars import ALONE, CI, HMD, ICI, SCENARIO
 from track_fusion.scenarios.sharma.surveillance import Courses, Radar, Surveillance
+from track_fusion.study.judgement import judged_claims
 from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.tracks import TrackBatch
 

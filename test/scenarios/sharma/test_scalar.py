@@ -5,9 +5,9 @@ import pytest
 
 from track_fusion.params import ParameterError
 from track_fusion.random_streams import stream
-from track_fusion.scenarios import judged_claims
 from track_fusion.scenarios.sharma import scalar as sharma_scalar
 from track_fusion.scenarios.sharma.scalar import RULE_CHOICES, SCENARIO, SETTINGS, STEPS, figures, simulate
+from track_fusion.study.judgement import judged_claims
 from track_fusion.study.rule_choice import RuleChoice
 
 RUNS = 200
