@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from track_fusion.angles import sample_moments
 from track_fusion.densities.log_domain import log_of, log_sum_exp
-from track_fusion.densities.mixture.mixture import Mixture
+from track_fusion.densities.mixture.mixture import LOG_2PI, Mixture
 from track_fusion.filters.base import Density, Evidence
 from track_fusion.linalg import Array, cholesky, transpose
 from track_fusion.models.base import Sensor, Transition
 from track_fusion.params import param
 from track_fusion.random_streams import Generators, RandomParams, exponentials, normals, stream, uniforms
 
-LOG_2PI = float(np.log(2.0 * np.pi))
 #: The largest double below one.
 BELOW_ONE = float(np.nextafter(1.0, 0.0))
 #: The smallest weight of a component.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Iterable, Sequence
 
@@ -110,7 +111,7 @@ class Study:
     def _follow(
         self, platforms: Platforms, begin: int, end: int, fuse: Fuse[MixtureModes] | None, known: Record | None
     ) -> tuple[Platforms, Record]:
-        record = Record(self.truth, len(platforms)) if known is None else known.copy()
+        record = Record(self.truth, len(platforms)) if known is None else copy.deepcopy(known)
         steps, after = range(begin, min(end, self.steps) + 1), platforms
         for step, (before, after) in zip(steps, follow(platforms, self.seen, steps, fuse), strict=True):
             record.estimate(step, [peer.density.moments for peer in after.values()])
@@ -138,12 +139,6 @@ class Record:
             "before": np.zeros((runs, platforms, (count - 1) // SCHEDULE.period, n)),
             "components": np.zeros((runs, platforms, 0 if count <= PICTURED else 5 * COMPONENTS, 6)),
         }
-
-    def copy(self) -> Record:
-        """Go on from here without changing this."""
-        other = Record(self._truth, self.outcomes["error"].shape[1])
-        other.outcomes = {name: values.copy() for name, values in self.outcomes.items()}
-        return other
 
     def estimate(self, step: int, moments: Sequence[tuple[Array, Array]]) -> None:
         """Keep the moments (R, n), (R, n, n) of each platform."""

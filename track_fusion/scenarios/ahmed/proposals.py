@@ -18,28 +18,13 @@ from track_fusion.densities.mixture.proposals import (
     laplace_proposals,
     prune_mixands,
 )
-from track_fusion.densities.mixture.quotient import (
-    Bound,
-    Laplace,
-    Quotient,
-    exact_bound,
-    exact_quotient,
-    laplace,
-)
+from track_fusion.densities.mixture.quotient import Bound, Laplace, Quotient, exact_bound, exact_quotient, laplace
 from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.random_streams import stream
 from track_fusion.rules import RULES
 from track_fusion.scenarios.ahmed import PAPER
-from track_fusion.scenarios.ahmed.mixtures import (
-    CELL_AREA,
-    GRID,
-    INGIS_VARIANCE,
-    Problem,
-    contour_chart,
-    scores,
-    shown,
-)
+from track_fusion.scenarios.ahmed.mixtures import CELL_AREA, GRID, INGIS_VARIANCE, Problem, contour_chart, scores, shown
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.claim import Claim
 from track_fusion.study.rows import Outcomes, Progress, chosen, run_by_run

@@ -15,14 +15,7 @@ from track_fusion.metrics.accuracy import Estimate
 from track_fusion.random_streams import stream
 from track_fusion.rules import FusedTracks
 from track_fusion.scenarios.ahmed import PAPER
-from track_fusion.scenarios.ahmed.mixtures import (
-    INGIS_VARIANCE,
-    Problem,
-    contour_chart,
-    log_fused,
-    scores,
-    shown,
-)
+from track_fusion.scenarios.ahmed.mixtures import INGIS_VARIANCE, Problem, contour_chart, log_fused, scores, shown
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.claim import Claim, ascending
 from track_fusion.study.rows import Outcomes, Progress, chosen, run_by_run

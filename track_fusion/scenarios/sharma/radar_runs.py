@@ -18,7 +18,7 @@ from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.rules import RULES
 from track_fusion.scenarios.sharma.surveillance import Courses, Radar, Surveillance
-from track_fusion.study.rows import Outcomes, Progress
+from track_fusion.study.rows import Outcomes, Progress, run_by_run
 from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.trackers.many_targets import PdaTracker, PdaTrackerParams
 from track_fusion.tracks import SECOND_NS, TrackBatch, planar_layout
@@ -188,11 +188,7 @@ def judged_alone(scans: Mapping[int, TrackBatch], truth: Array) -> Judged:
 
 def tracked(rows: Mapping[str, RuleChoice | None], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Run rules, and the radars alone (None), on the same tracks of the radars; see :func:`simulate`."""
-    each = [
-        _one_run(rows, seed, run, lambda share, done=done: progress((done + share) / len(runs)))  # type: ignore[misc]
-        for done, run in enumerate(runs)
-    ]
-    return {name: np.stack([one[name] for one in each]) for name in each[0]}
+    return run_by_run(runs, progress, lambda run, tell: _one_run(rows, seed, run, tell))
 
 
 def _one_run(rows: Mapping[str, RuleChoice | None], seed: int, run: int, progress: Progress) -> dict[str, Array]:
