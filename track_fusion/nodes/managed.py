@@ -21,7 +21,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from msg_adapters.arrays import MessageError
 from msg_adapters.diagnostics import diagnostic_array
-from msg_adapters.types import message_class
+from msg_adapters.classes import message_class
 from track_fusion.nodes.ros_params import declare, refuse_unknown, unfit_files
 from track_fusion.params import Fault, ParameterError, Params, param
 
