@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 
+from track_fusion.angles import wraps
 from track_fusion.linalg import Array, matvec, transpose
 from track_fusion.params import ParameterError, Params
 from track_fusion.rules import RULES, FusedTracks, Rule, SourceTracks
@@ -67,7 +68,7 @@ def fuse_runs(
     Notes    A linear rule gives sum of A_i x_i; fusing unit vectors gives its matrices A_i.
     """
     runs, count, n = mean.shape
-    if len(cov) < runs and choice.rule.linear and not np.isfinite(periods).any():
+    if len(cov) < runs and choice.rule.linear and not wraps(periods):
         units = np.eye(count * n).reshape(-1, count, n)
         fused = choice.fuse(SourceTracks(units, np.repeat(cov, len(units), 0)))
         weights = None if fused.weights is None else fused.weights[:1]
