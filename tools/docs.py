@@ -215,16 +215,18 @@ def fusion_centre_sections() -> list[Section]:
         StateFusionParams,
         TrackManagerParams,
     )
+    from track_fusion.messages.centre import OneSourceParams, SourceParams
+    from track_fusion.messages.parameters import ManagedParams
+    from track_fusion.messages.screening import FrameParams
     from track_fusion.models.choices import MOTIONS, MotionChoice
-    from track_fusion.nodes.fusion_centre import SourceParams
-    from track_fusion.nodes.managed import ManagedParams
-    from track_fusion.nodes.screening import FrameParams
     from track_fusion.random_streams import RandomParams
 
     default, declared = StateFusionParams().state_fusion, "declared when state_fusion is"
     rules = {key: rule for key, rule in TRACK_RULES.own.items() if specs(rule.params)}
     return [
-        *map(Section, (FrameParams, SourceParams, MotionChoice)),
+        *map(Section, (FrameParams, SourceParams)),
+        *(Section(OneSourceParams, f"{name}.", f"The source {name}.") for name in SourceParams().source_configurations),
+        Section(MotionChoice),
         *_alternatives("motion", MOTIONS.own, MotionChoice().motion),
         *map(Section, (StateFusionParams, FusionCentreParams)),
         *(
@@ -239,9 +241,9 @@ def fusion_centre_sections() -> list[Section]:
 
 def sensor_tracker_sections() -> list[Section]:
     """List what a sensor tracker declares; a test compares it with the node."""
+    from track_fusion.messages.parameters import ManagedParams
+    from track_fusion.messages.screening import FrameParams
     from track_fusion.models.choices import MOTIONS, SENSORS, Choice
-    from track_fusion.nodes.managed import ManagedParams
-    from track_fusion.nodes.screening import FrameParams
     from track_fusion.nodes.sensor_tracker import FeedbackParams, OutputParams
     from track_fusion.trackers.filters import FILTERS
     from track_fusion.trackers.many_targets import PdaTracker, PdaTrackerParams

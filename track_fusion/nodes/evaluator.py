@@ -13,11 +13,11 @@ from sensor_msgs.msg import PointCloud2
 from msg_adapters.header import stamp_to_ns
 from msg_adapters.track_table import track_table_from_msg
 from msg_adapters.types import MESSAGE_TYPES
+from track_fusion.messages.screening import FrameParams, screened_tracks
 from track_fusion.metrics.evaluation import Evaluation, EvaluationParams
 from track_fusion.nodes.managed import ManagedNode, class_of
 from track_fusion.nodes.process import end, run
 from track_fusion.nodes.ros_params import declare
-from track_fusion.nodes.screening import FrameParams, screened_tracks
 from track_fusion.params import Params, param
 
 #: How often the end of the run is looked for, wall time.
