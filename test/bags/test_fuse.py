@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from cli.runner import refusal, run
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
@@ -34,7 +33,7 @@ def expected(name: str) -> dict[str, Any]:
 
 
 def params_file(folder: Path, oracle: str, **given: Any) -> Path:
-    """Write a parameter file as a node reads it, with the parameters of an oracle."""
+    """Write a parameter file (JSON is YAML) as a node reads it, with the parameters of an oracle."""
     names, of_oracle = {"sources": "source_configurations", "layout": "axes"}, expected(oracle)["parameters"]
     rule = f"{of_oracle['state_fusion']}."
     own = {names.get(k, k): v for k, v in of_oracle.items() if "." not in k or k.startswith(rule)}
@@ -43,7 +42,7 @@ def params_file(folder: Path, oracle: str, **given: Any) -> Path:
     own |= {"source_types": ["odometry" if oracle == "odometry" else "track_table"] * 2}
     own |= {"fusion_timeout_s": 1000.0, "source_timeout_s": 10_000.0, "max_delay_s": 1000.0, "max_future_s": 10.0}
     path = folder / "centre.yaml"
-    path.write_text(yaml.safe_dump({"fusion_centre": {"ros__parameters": own | given}}))
+    path.write_text(json.dumps({"fusion_centre": {"ros__parameters": own | given}}))
     return path
 
 

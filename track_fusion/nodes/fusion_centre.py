@@ -8,8 +8,9 @@ from functools import partial
 from typing import Any
 
 from nav_msgs.msg import Odometry
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import UInt64
 from visualization_msgs.msg import MarkerArray
 
 from msg_adapters.markers import markers_to_msg
@@ -18,7 +19,7 @@ from msg_adapters.track_table import track_table_to_msg
 from track_fusion.centre.centre import Published
 from track_fusion.centre.publish import StepInfo
 from track_fusion.messages.centre import MessageCentre
-from track_fusion.nodes.managed import ManagedNode
+from track_fusion.nodes.managed import ManagedNode, qos
 from track_fusion.nodes.process import end, run
 from track_fusion.nodes.ros_params import declare
 from track_fusion.params import ParameterError
@@ -35,7 +36,7 @@ class FusionCentreNode(ManagedNode):
         """Declare parameters and build the centre."""
         self.messages = MessageCentre(partial(declare, self), self._parameter_overrides, self.counts)
         self.centre = self.messages.centre
-        self._latency_s = 0.0
+        self._latency_s, self._handled = 0.0, 0
         self._last: StepInfo | None = None
 
     def connect(self) -> None:
@@ -43,6 +44,8 @@ class FusionCentreNode(ManagedNode):
         self._tracks = self.publisher(PointCloud2, "~/tracks", expected=self.managed.expected_subscribers)
         self._odometry = self.publisher(Odometry, "~/odometry")
         self._markers = self.publisher(MarkerArray, "~/markers")
+        matched = PublisherEventCallbacks(matched=self._tell_count)
+        self._processed = self.create_publisher(UInt64, "~/processed", qos(1, latched=True), event_callbacks=matched)
         for k, source in enumerate(self.messages.sources):
             try:
                 message = source.kind.load()
@@ -66,7 +69,16 @@ class FusionCentreNode(ManagedNode):
         )
 
     def _take(self, source: int, msg: Any) -> None:
-        self._publish_all(self.messages.take(source, msg, self.now_ns()))
+        try:
+            self._publish_all(self.messages.take(source, msg, self.now_ns()))
+        finally:
+            self._handled += 1
+            if self._processed.get_subscription_count():
+                self._tell_count()
+
+    def _tell_count(self, _: Any = None) -> None:
+        """Say how many messages were handled, those turned away included; while nobody listens nothing is said."""
+        self._processed.publish(UInt64(data=self._handled))
 
     def _on_timer(self) -> None:
         if self.active and self.released:

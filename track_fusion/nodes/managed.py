@@ -15,7 +15,7 @@ from rclpy.clock import Clock, JumpThreshold
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from msg_adapters.arrays import MessageError
@@ -33,9 +33,12 @@ LOOK_PERIOD_S = 0.02
 MAX_HELD = 10_000
 
 
-def qos(depth: int) -> QoSProfile:
-    """Reliable, keep the last `depth`: the default of every topic of this package."""
-    return QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=depth)
+def qos(depth: int, *, latched: bool = False) -> QoSProfile:
+    """Reliable, keep the last `depth`: the default of every topic of this package; latched: also for late readers."""
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+    return QoSProfile(
+        reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=depth, durability=durability
+    )
 
 
 def class_of(kind: str) -> type:
