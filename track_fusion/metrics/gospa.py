@@ -77,8 +77,12 @@ def set_distance(targets: Array, tracks: Array, params: SetDistanceParams) -> Se
     equation 2 and proposition 1; D. Schuhmacher, B.-T. Vo, B.-N. Vo, A consistent metric for performance evaluation of
     multi-object filters, 2008, equation 3
     """
+    return set_distance_of(distances(targets, tracks), params)
+
+
+def set_distance_of(between: Array, params: SetDistanceParams) -> SetDistance:
+    """`set_distance` of sets of points between which the distances, (N, M), are known."""
     c, p = params.cutoff_m, params.order
-    between = distances(targets, tracks)
     target, track = pairs_within(between, c, p)
     distance = between[target, track]
     pairs, most = len(target), max(between.shape)
