@@ -26,6 +26,8 @@ HALF_TURN = np.pi
 KNOWN_PERIODS: Mapping[str, float] = dict.fromkeys(
     ("yaw", "heading", "course", "roll", "pitch", "bearing", "azimuth", "elevation"), TURN
 )
+#: What a user writes behind the name of a direction whose sign is unknown.
+SIGN_UNKNOWN = ":pi"
 #: States this close to opposite, in the unit of the axis, have no mean direction: rounding would decide.
 OPPOSITE = 1e-6
 
@@ -47,6 +49,17 @@ def periods_of(axes: Sequence[str], wraps: Mapping[str, float] | None = None) ->
     if unknown:
         raise ValueError(f"The angular axis '{unknown[0]}' is none of the axes {', '.join(axes)}.")
     return tuple(float(wraps.get(a, KNOWN_PERIODS.get(a, np.inf))) for a in axes)
+
+
+def named_period(spelt: str) -> tuple[str, float]:
+    """Read an angular axis as users spell it: `psi` wraps after a turn, `psi:pi`, its sign unknown, after half a turn.
+
+    Returns
+    -------
+    name, period
+    """
+    name = spelt.removesuffix(SIGN_UNKNOWN)
+    return name, TURN if name == spelt else HALF_TURN
 
 
 def wraps(periods: Any) -> bool:

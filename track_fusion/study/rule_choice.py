@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from track_fusion.angles import wraps
 from track_fusion.linalg import Array, matvec, transpose
-from track_fusion.params import ParameterError, Params
+from track_fusion.params import ParameterError, Params, from_dict
 from track_fusion.rules import RULES, FusedTracks, Rule, SourceTracks
 from track_fusion.study.rows import Outcomes, Progress, row_by_row
 
@@ -22,6 +23,16 @@ class RuleChoice:
     key: str
     params: Params
     variant: str = ""
+
+    @classmethod
+    def of(cls, key: str, variant: str = "", /, **values: Any) -> RuleChoice:
+        """Choose a rule by its key; parameters that are not given have their defaults.
+
+        Raises
+        ------
+        ParameterError    no such rule or parameter
+        """
+        return cls(key, from_dict(RULES[key].params, values), variant)
 
     @property
     def name(self) -> str:
