@@ -103,6 +103,7 @@ class FusionCentreNode(ManagedNode):
             CentreConfig(
                 sources, motion, self.frame.frame_id, rule, rule_params, declare(self, FusionCentreParams),
                 declare(self, TrackManagerParams), declare(self, ScanBufferParams), declare(self, RandomParams),
+                self.clock,
             )
         )  # fmt: skip
         self._latency_s = 0.0
@@ -151,7 +152,6 @@ class FusionCentreNode(ManagedNode):
         return read
 
     def _take(self, source: int, scan: TrackBatch, stamp_ns: int, now_ns: int) -> None:
-        now_ns = max(now_ns, stamp_ns)
         if reason := self.centre.receive(source, scan, stamp_ns, now_ns):
             name = self.sources.source_configurations[source]
             self.reject({reason: 1}, f"a scan of {name} stamped {stamp_ns / 1e9:.3f} s")
@@ -170,7 +170,7 @@ class FusionCentreNode(ManagedNode):
         """Publish what is due by now."""
         began = time.perf_counter()
         for result in self.centre.advance(now_ns):
-            self.reject(result.superseded, "a newer scan of the source came before its fusion")
+            self.reject(result.kept_out, "a newer scan of the source came before its fusion, or it was too old for it")
             self._publish(result.tracks, result.time_ns)
             self._latency_s = time.perf_counter() - began
             self._last = result.info
