@@ -38,11 +38,11 @@ from track_fusion.params import ParameterError, Params, param
 from track_fusion.plugins import Registry
 from track_fusion.random_streams import RandomParams
 from track_fusion.rules import RULES
-from track_fusion.tracks import TrackBatch
+from track_fusion.tracks import SECOND_NS, TrackBatch
 
 #: Message types of sources by key, those of other packages included.
 SOURCE_TYPES: Registry[MessageType] = Registry("track_fusion.adapters", "source type", MessageType, MESSAGE_TYPES)
-#: How often waiting scans and silent sources are looked at, in ROS time.
+#: How often silent sources are looked at, in ROS time; scans that wait are, when their time has come.
 LOOK_PERIOD_S = 0.02
 
 
@@ -122,7 +122,7 @@ class FusionCentreNode(ManagedNode):
             depth = 10 if kind.whole_scan else 1000  # of a scan in pieces, each is a message
             lost = SubscriptionEventCallbacks(message_lost=self._on_lost)
             self.subscribe(message, f"~/sources/{name}/tracks", self._reader(k, kind), depth, event_callbacks=lost)
-        self.create_timer(LOOK_PERIOD_S, self._on_timer)
+        self._timer = self.create_timer(LOOK_PERIOD_S, self._on_timer)
 
     def on_start(self) -> None:
         """Say what it does: a parameter file for another node's name would go unnoticed."""
@@ -155,7 +155,6 @@ class FusionCentreNode(ManagedNode):
         if reason := self.centre.receive(source, scan, stamp_ns, now_ns):
             name = self.sources.source_configurations[source]
             self.reject({reason: 1}, f"a scan of {name} stamped {stamp_ns / 1e9:.3f} s")
-            return
         self._advance(now_ns)
 
     def _on_timer(self) -> None:
@@ -180,6 +179,16 @@ class FusionCentreNode(ManagedNode):
             self.counted["beyond_half_circle"] += result.info.beyond_half_circle
             self.counted["deleted"] += len(result.info.changes.deleted)
             began = time.perf_counter()
+        if self.centre.resets != self.counted["clock_resets"]:
+            self.log.warning("The clock has jumped back: all tracks are forgotten.")
+            self.counted["clock_resets"] = self.centre.resets
+        self._look_again(now_ns)
+
+    def _look_again(self, now_ns: int) -> None:
+        """Set the timer to when time alone may make a step due."""
+        wake_ns, look_ns = self.centre.wake_ns(now_ns), round(LOOK_PERIOD_S * SECOND_NS)
+        self._timer.timer_period_ns = look_ns if wake_ns is None else min(wake_ns - now_ns, look_ns)
+        self._timer.reset()
 
     def _publish(self, fused: TrackBatch, stamp_ns: int) -> None:
         axes = self.centre.config.layout.axes
