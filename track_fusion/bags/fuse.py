@@ -14,6 +14,7 @@ from msg_adapters.track_table import track_table_to_msg
 from track_fusion.bags.read import deserialised, open_bag
 from track_fusion.bags.write import add_topic, bag_class, copy_topic, create_bag, serialised
 from track_fusion.centre.centre import Published
+from track_fusion.clock import ClockParams
 from track_fusion.messages.centre import MessageCentre
 from track_fusion.messages.counts import Counts
 from track_fusion.messages.parameters import GivenParameters, ManagedParams, parameters_of
@@ -58,7 +59,7 @@ def centre_of(params: Path, tell: Callable[[str], object]) -> MessageCentre:
     """
     given = GivenParameters(parameters_of(params, f"/{NODE}"), NODE)
     given(ManagedParams)
-    centre = MessageCentre(given, given.values, Counts(tell))
+    centre = MessageCentre(given, given.values, Counts(tell), given(ClockParams))
     given.refuse_unknown()
     return centre
 

@@ -19,6 +19,7 @@ from track_fusion.centre.config import (
     StateFusionParams,
     TrackManagerParams,
 )
+from track_fusion.clock import ClockParams
 from track_fusion.messages.counts import Counts
 from track_fusion.messages.parameters import Declare, refuse_of_others
 from track_fusion.messages.screening import FrameParams, screened_tracks
@@ -27,9 +28,13 @@ from track_fusion.params import ParameterError, Params, param
 from track_fusion.plugins import Registry
 from track_fusion.random_streams import RandomParams
 from track_fusion.rules import RULES
+from track_fusion.tracks import SECOND_NS
 
 #: Message types of sources by key, those of other packages included.
 SOURCE_TYPES: Registry[MessageType] = Registry("track_fusion.adapters", "source type", MessageType, MESSAGE_TYPES)
+
+#: When the clock has gone on by more than this since it was told last, it has jumped, and nothing is made up for.
+CATCH_UP_NS = 60 * SECOND_NS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,6 +101,7 @@ class MessageCentre:
     declare : Declare            gives its parameters
     given : iterable of str      names of all parameters that were given
     counts : Counts
+    clock : ClockParams
 
     Raises
     ------
@@ -109,7 +115,7 @@ class MessageCentre:
     counts : Counts
     """
 
-    def __init__(self, declare: Declare, given: Iterable[str], counts: Counts) -> None:
+    def __init__(self, declare: Declare, given: Iterable[str], counts: Counts, clock: ClockParams) -> None:
         self.frame, self.counts = declare(FrameParams), counts
         params = declare(SourceParams)
         self._cross_block: CrossBlock = "conservative" if params.cross_block == "conservative" else "block_diagonal"
@@ -125,9 +131,10 @@ class MessageCentre:
             CentreConfig(
                 sources, motion, self.frame.frame_id, rule, declare(rule.params, f"{rule.key}."),
                 declare(FusionCentreParams), declare(TrackManagerParams), declare(ScanBufferParams),
-                declare(RandomParams),
+                declare(RandomParams), clock,
             )
         )  # fmt: skip
+        self._told_ns = 0
 
     def take(self, source: int, msg: Any, now_ns: int) -> Iterator[Published]:
         """Take a message of a source, and run the steps that are due: first those of the time before it.
@@ -144,17 +151,32 @@ class MessageCentre:
         arrays, supplied = kind.read(msg, layout.axes, self._cross_block)
         if kind.lacks:
             self.counts.counted[f"{kind.lacks}_absent"] += supplied
-        scan, now_ns = screened_tracks(self.counts, arrays, layout), max(now_ns, stamp_ns)
+        scan = screened_tracks(self.counts, arrays, layout)
         if reason := self.centre.receive(source, scan, stamp_ns, now_ns):
             self.counts.reject({reason: 1}, f"a scan of {self.sources[source].name} stamped {stamp_ns / 1e9:.3f} s")
-            return
         yield from self.advance(now_ns)
 
     def advance(self, now_ns: int) -> Iterator[Published]:
-        """Run the steps that are due by now, one whenever the next result is asked for; count what happened."""
+        """Run the steps that are due by now, one whenever the next result is asked for; count what happened.
+
+        Each runs at the moment at which it became due, so that how often one asks changes nothing.
+        """
+        for moment_ns in self._moments(now_ns):
+            yield from self._advance(moment_ns)
+
+    def _moments(self, now_ns: int) -> Iterator[int]:
+        """Yield when time alone may have made a step due since it was told last, and now."""
+        last_ns = max(min(self._told_ns, now_ns), now_ns - CATCH_UP_NS)
+        self._told_ns = now_ns
+        while (wake_ns := self.centre.wake_ns(last_ns)) is not None and wake_ns < now_ns:
+            yield wake_ns
+            last_ns = wake_ns
+        yield now_ns
+
+    def _advance(self, now_ns: int) -> Iterator[Published]:
         counted = self.counts.counted
         for result in self.centre.advance(now_ns):
-            self.counts.reject(result.superseded, "a newer scan of the source came before its fusion")
+            self.counts.reject(result.kept_out, "a newer scan of the source came before its fusion, or it was too old")
             counted["steps"] += 1
             counted["unconverged"] += result.info.unconverged
             counted["unsound"] += result.info.unsound

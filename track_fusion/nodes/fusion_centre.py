@@ -23,7 +23,7 @@ from track_fusion.nodes.managed import ManagedNode, qos
 from track_fusion.nodes.process import end, run
 from track_fusion.nodes.ros_params import declare
 from track_fusion.params import ParameterError
-from track_fusion.tracks import TrackBatch
+from track_fusion.tracks import SECOND_NS, TrackBatch
 
 #: How often waiting scans and silent sources are looked at, in ROS time.
 LOOK_PERIOD_S = 0.02
@@ -34,7 +34,7 @@ class FusionCentreNode(ManagedNode):
 
     def declare_parameters_(self) -> None:
         """Declare parameters and build the centre."""
-        self.messages = MessageCentre(partial(declare, self), self._parameter_overrides, self.counts)
+        self.messages = MessageCentre(partial(declare, self), self._parameter_overrides, self.counts, self.clock)
         self.centre = self.messages.centre
         self._latency_s, self._handled = 0.0, 0
         self._last: StepInfo | None = None
@@ -54,7 +54,7 @@ class FusionCentreNode(ManagedNode):
             depth = 10 if source.kind.whole_scan else 1000  # of a scan in pieces, each is a message
             lost = SubscriptionEventCallbacks(message_lost=self._on_lost)
             self.subscribe(message, source.topic, partial(self._take, k), depth, event_callbacks=lost)
-        self.create_timer(LOOK_PERIOD_S, self._on_timer)
+        self._timer = self.create_timer(LOOK_PERIOD_S, self._on_timer)
 
     def on_start(self) -> None:
         """Say what it does: a parameter file for another node's name would go unnoticed."""
@@ -95,6 +95,17 @@ class FusionCentreNode(ManagedNode):
             self._publish(result.tracks, result.time_ns)
             self._latency_s, self._last = time.perf_counter() - began, result.info
             began = time.perf_counter()
+        if self.centre.resets != self.counted["clock_resets"]:
+            self.log.warning("The clock has jumped back: all tracks are forgotten.")
+            self.counted["clock_resets"] = self.centre.resets
+        self._look_again()
+
+    def _look_again(self) -> None:
+        """Set the timer to when time alone may make a step due."""
+        now_ns, look_ns = self.now_ns(), round(LOOK_PERIOD_S * SECOND_NS)
+        wake_ns = self.centre.wake_ns(now_ns)
+        self._timer.timer_period_ns = look_ns if wake_ns is None else min(wake_ns - now_ns, look_ns)
+        self._timer.reset()
 
     def _publish(self, fused: TrackBatch, stamp_ns: int) -> None:
         axes = self.centre.config.layout.axes

@@ -21,6 +21,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from msg_adapters.arrays import MessageError
 from msg_adapters.classes import message_class
 from msg_adapters.diagnostics import diagnostic_array
+from track_fusion.clock import ClockParams
 from track_fusion.messages.counts import Counts
 from track_fusion.messages.parameters import ManagedParams
 from track_fusion.nodes.ros_params import declare, refuse_unknown_of, unfit_files
@@ -75,7 +76,7 @@ class ManagedNode(LifecycleNode):
         self._held: deque[tuple[Callable[[Any], None], Any]] = deque()
         self._look: Any = None
         self._wall = Clock(clock_type=ClockType.STEADY_TIME)
-        self.managed = declare(self, ManagedParams)
+        self.managed, self.clock = declare(self, ManagedParams), declare(self, ClockParams)
         self.declare_parameters_()
         refuse_unknown_of(self)
         self._warn_of_unfit_files(kwargs)
@@ -252,7 +253,11 @@ class ManagedNode(LifecycleNode):
         return self.create_timer(period_s, call, clock=self._wall)
 
     def _on_jump(self, jump: Any) -> None:
-        self.log.warning("The clock has jumped back: starting anew.")
+        back_ns = -int(jump.delta.nanoseconds)
+        if back_ns <= self.clock.tolerance_ns:
+            self.counted["clock_steps"] += 1
+            return
+        self.log.warning(f"The clock has jumped back by {back_ns / 1e9:.3f} s: starting anew.")
         self.counted["clock_jumps"] += 1
         self._held.clear()
         self.on_clock_jump()
