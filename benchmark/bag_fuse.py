@@ -17,7 +17,7 @@ from track_fusion.tracks import SECOND_NS, TrackBatch, planar_layout
 
 SOURCES, TRACKS, STEPS = 3, 100, 300
 PERIOD_NS = SECOND_NS // 10
-ROUNDS = 3
+ROUNDS = 7
 
 
 def run() -> Iterator[Result]:
