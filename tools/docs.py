@@ -217,10 +217,11 @@ def fusion_centre_sections() -> list[Section]:
         StateFusionParams,
         TrackManagerParams,
     )
+    from track_fusion.clock import ClockParams
+    from track_fusion.messages.centre import OneSourceParams, SourceParams
+    from track_fusion.messages.parameters import ManagedParams
+    from track_fusion.messages.screening import FrameParams
     from track_fusion.models.choices import MOTIONS, MotionChoice
-    from track_fusion.nodes.fusion_centre import SourceParams
-    from track_fusion.nodes.managed import ManagedParams
-    from track_fusion.nodes.screening import FrameParams
     from track_fusion.random_streams import RandomParams
 
     default, declared = StateFusionParams().state_fusion, "declared when state_fusion is"
@@ -228,8 +229,9 @@ def fusion_centre_sections() -> list[Section]:
     return [
         *map(Section, (FrameParams, SourceParams)),
         *(
-            Section(SourceSettings, f"{name}.", f"What is declared of {name}.")
+            Section(kind, f"{name}.", title and f"{title} {name}.")
             for name in SourceParams().source_configurations
+            for kind, title in ((OneSourceParams, "The source"), (SourceSettings, "What is declared of"))
         ),
         Section(MotionChoice),
         *_alternatives("motion", MOTIONS.own, MotionChoice().motion),
@@ -240,15 +242,17 @@ def fusion_centre_sections() -> list[Section]:
         ),
         *map(Section, (ScanBufferParams, TrackManagerParams, IdentityParams)),
         Section(RandomParams, title="Random numbers of rules that draw samples: seed, run and role name a stream."),
+        Section(ClockParams),
         Section(ManagedParams),
     ]
 
 
 def sensor_tracker_sections() -> list[Section]:
     """List what a sensor tracker declares; a test compares it with the node."""
+    from track_fusion.clock import ClockParams
+    from track_fusion.messages.parameters import ManagedParams
+    from track_fusion.messages.screening import FrameParams
     from track_fusion.models.choices import MOTIONS, SENSORS, Choice
-    from track_fusion.nodes.managed import ManagedParams
-    from track_fusion.nodes.screening import FrameParams
     from track_fusion.nodes.sensor_tracker import FeedbackParams, OutputParams
     from track_fusion.trackers.filters import FILTERS
     from track_fusion.trackers.many_targets import PdaTracker, PdaTrackerParams
@@ -261,7 +265,7 @@ def sensor_tracker_sections() -> list[Section]:
         *_alternatives("motion", MOTIONS.own, default.motion),
         *_alternatives("sensor", SENSORS, default.sensor),
         *_alternatives("filter", filters, default.filter),
-        *map(Section, (SensorTrackerParams, FeedbackParams, OutputParams, ManagedParams)),
+        *map(Section, (SensorTrackerParams, FeedbackParams, OutputParams, ClockParams, ManagedParams)),
     ]
 
 
