@@ -211,7 +211,9 @@ def fusion_centre_sections() -> list[Section]:
     from track_fusion.centre.config import (
         TRACK_RULES,
         FusionCentreParams,
+        IdentityParams,
         ScanBufferParams,
+        SourceSettings,
         StateFusionParams,
         TrackManagerParams,
     )
@@ -226,7 +228,11 @@ def fusion_centre_sections() -> list[Section]:
     rules = {key: rule for key, rule in TRACK_RULES.own.items() if specs(rule.params)}
     return [
         *map(Section, (FrameParams, SourceParams)),
-        *(Section(OneSourceParams, f"{name}.", f"The source {name}.") for name in SourceParams().source_configurations),
+        *(
+            Section(kind, f"{name}.", f"{what} {name}.")
+            for name in SourceParams().source_configurations
+            for kind, what in ((OneSourceParams, "The source"), (SourceSettings, "What is declared of"))
+        ),
         Section(MotionChoice),
         *_alternatives("motion", MOTIONS.own, MotionChoice().motion),
         *map(Section, (StateFusionParams, FusionCentreParams)),
@@ -234,7 +240,7 @@ def fusion_centre_sections() -> list[Section]:
             Section(rule.params, f"{key}.", f"{rule.title}: {declared} {key}.", declared=key == default)
             for key, rule in rules.items()
         ),
-        *map(Section, (ScanBufferParams, TrackManagerParams)),
+        *map(Section, (ScanBufferParams, TrackManagerParams, IdentityParams)),
         Section(RandomParams, title="Random numbers of rules that draw samples: seed, run and role name a stream."),
         Section(ClockParams),
         Section(ManagedParams),

@@ -9,11 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from track_fusion.centre import rhythm
 from track_fusion.centre.config import CentreConfig, ScanBufferParams
 from track_fusion.tracks import SECOND_NS, TrackBatch
 
-#: So many stamps of a source tell its period: their median difference bears a few lost or jumping ones.
-STAMPS_KEPT = 9
 #: A source is due this share of a period after its last scan: stamps jitter.
 DUE_SHARE = 0.9
 
@@ -102,9 +101,8 @@ class Step(NamedTuple):
 
 
 def period_ns(queue: Queue) -> int:
-    """Tell the period of a source, the median difference of its stamps, 0 = unknown yet."""
-    gaps = sorted(b - a for a, b in zip(queue.stamps, queue.stamps[1:], strict=False))
-    return gaps[len(gaps) // 2] if gaps else 0
+    """Tell the period of a source, 0 = unknown yet."""
+    return rhythm.period_ns(queue.stamps)
 
 
 def add(
@@ -125,13 +123,17 @@ def add(
     -------
     ScanBuffer
     str or None    `stale_scan`, `out_of_order_scan`, `duplicate_scan`, `late_scan`, `duplicate_track_id` (of a piece
-                   those tracks alone are turned away that its scan has already)
+                   those tracks alone are turned away that its scan has already), `too_many_tracks` (of pieces put
+                   together, too; as if the source had not been heard)
     """
     queue = buffer.queues[source]
     reason = _refusal(config.buffer, buffer, queue, stamp_ns, now_ns)
     if reason is None:
         assembles = config.sources[source].assembles
         queue, reason = _taken_in(assembles, queue, Waiting(stamp_ns, now_ns, now_ns, scan))
+    most = config.sources[source].settings.max_tracks_per_scan
+    if reason is None and any(len(waiting.scan) > most for waiting in queue.waiting):
+        return buffer, "too_many_tracks"
     queues = list(buffer.queues)
     if reason is None:
         # The silence of sources that were never heard begins with the first scan of any.
@@ -165,7 +167,7 @@ def _taken_in(assembles: bool, queue: Queue, new: Waiting) -> tuple[Queue, str |
     if same is not None:
         return _joined(queue, same, new)
     waiting = sorted((*queue.waiting, new._replace(scan=new.scan.owned())), key=lambda w: w.stamp_ns)
-    stamps = tuple(sorted((*queue.stamps, new.stamp_ns))[-STAMPS_KEPT:])
+    stamps = tuple(sorted((*queue.stamps, new.stamp_ns))[-rhythm.STAMPS_KEPT :])
     queue = dataclasses.replace(queue, waiting=tuple(waiting), stamps=stamps)
     return dataclasses.replace(queue, ids=ids, expected=queue.ids) if new.stamp_ns > newest else queue, None
 

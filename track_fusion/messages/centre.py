@@ -14,8 +14,10 @@ from track_fusion.centre.config import (
     MAX_SOURCES,
     CentreConfig,
     FusionCentreParams,
+    IdentityParams,
     ScanBufferParams,
     SourceConfig,
+    SourceSettings,
     StateFusionParams,
     TrackManagerParams,
 )
@@ -64,6 +66,11 @@ class SourceParams(Params):
         if not 1 <= len(names) <= MAX_SOURCES or len(set(names)) < len(names) or not all(names):
             raise ParameterError(
                 f"The 'source_configurations' parameter must hold 1 to {MAX_SOURCES} distinct names. Got {list(names)}."
+            )
+        if taken := sorted(set(names) & set(RULES)):
+            raise ParameterError(
+                f"The 'source_configurations' parameter must not hold names of fusion rules, whose parameters begin "
+                f"with them. Got {', '.join(taken)}."
             )
         if self.source_types and len(self.source_types) != len(names):
             raise ParameterError(
@@ -126,12 +133,15 @@ class MessageCentre:
         motion = make(MOTIONS, key, declare(MOTIONS[key].params), self.frame.layout)
         rule = RULES[declare(StateFusionParams).state_fusion]
         refuse_of_others(given, RULES, "state_fusion", rule.key)
-        sources = tuple(SourceConfig(s.name, assembles=not s.kind.whole_scan) for s in self.sources)
+        sources = tuple(
+            SourceConfig(s.name, assembles=not s.kind.whole_scan, settings=declare(SourceSettings, f"{s.name}."))
+            for s in self.sources
+        )
         self.centre = FusionCentre(
             CentreConfig(
                 sources, motion, self.frame.frame_id, rule, declare(rule.params, f"{rule.key}."),
                 declare(FusionCentreParams), declare(TrackManagerParams), declare(ScanBufferParams),
-                declare(RandomParams), clock,
+                declare(RandomParams), clock=clock, identity=declare(IdentityParams),
             )
         )  # fmt: skip
         self._told_ns = 0
@@ -145,8 +155,9 @@ class MessageCentre:
         """
         yield from self.advance(now_ns)
         layout, kind = self.centre.config.layout, self.sources[source].kind
+        own_now_ns = now_ns - self.centre.config.sources[source].settings.time_offset_ns  # by the source's clock
         stamp_ns = check_header(
-            msg.header, frame_id=self.frame.frame_id, now_ns=now_ns, max_future_ns=self.frame.max_future_ns
+            msg.header, frame_id=self.frame.frame_id, now_ns=own_now_ns, max_future_ns=self.frame.max_future_ns
         )
         arrays, supplied = kind.read(msg, layout.axes, self._cross_block)
         if kind.lacks:
@@ -182,4 +193,5 @@ class MessageCentre:
             counted["unsound"] += result.info.unsound
             counted["beyond_half_circle"] += result.info.beyond_half_circle
             counted["deleted"] += len(result.info.changes.deleted)
+            counted["dropped_tentative"] += len(result.info.changes.dropped)
             yield result

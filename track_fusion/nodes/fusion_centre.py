@@ -131,6 +131,8 @@ class FusionCentreNode(ManagedNode):
             warnings.append(f"{unsound} fusions gave no density; a single source was taken instead")
         if beyond := self.counted["beyond_half_circle"]:
             warnings.append(f"{beyond} fusions were of angles more than a half circle apart, which have no mean")
+        if dropped := self.counted["dropped_tentative"]:
+            warnings.append(f"{dropped} tentative tracks were dropped: more than max_tentative_tracks at a time")
         if self._last is not None:
             values["members"] = self._last.members.tolist()
             if self._last.shared_provenance and rule.guarantee_at(self.centre.config.rule_params) != "conservative":

@@ -167,9 +167,14 @@ class SensorTrackerNode(ManagedNode):
                 self._odometry.publish(msg)
 
     def diagnose(self) -> tuple[list[str], dict[str, Any]]:
-        """Warn when feedback was missing."""
-        missing = self.counted["feedback_timeouts"]
-        return ([f"{missing} scans without feedback"] if missing else []), {"waiting_scans": len(self._queue)}
+        """Warn when feedback was missing, or tentative tracks were dropped."""
+        missing, values = self.counted["feedback_timeouts"], {"waiting_scans": len(self._queue)}
+        warnings = [f"{missing} scans without feedback"] if missing else []
+        if isinstance(self.tracker, PdaTracker):
+            values["dropped_tentative"] = dropped = self.tracker.tracks.dropped
+            if dropped:
+                warnings.append(f"{dropped} tentative tracks were dropped: more than max_tentative_tracks at a time")
+        return warnings, values
 
 
 def main() -> None:
