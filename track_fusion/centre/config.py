@@ -240,8 +240,8 @@ class CentreConfig:
     ------
     ParameterError    too many sources; the rule needs what source tracks do not bring, such as their
                       cross-covariance; `confirmation_sources` exceeds them; weights are given that do not fit the
-                      sources; not one number an axis in
-                      `particle_variances`; a transform does not bring every axis of the centre
+                      sources; not one number an axis in `particle_variances`; a transform does not bring every axis of
+                      the centre
     """
 
     sources: tuple[SourceConfig, ...]
