@@ -233,8 +233,8 @@ class CentreConfig:
     manager : TrackManagerParams
     buffer : ScanBufferParams
     random : RandomParams              what rules that sample draw from, step after step
-    clock : ClockParams                how far the clocks may be trusted
     identity : IdentityParams
+    clock : ClockParams                how far the clocks may be trusted
 
     Raises
     ------
@@ -253,8 +253,8 @@ class CentreConfig:
     manager: TrackManagerParams = TrackManagerParams()
     buffer: ScanBufferParams = ScanBufferParams()
     random: RandomParams = RandomParams(role="fusion_centre")
-    clock: ClockParams = ClockParams()
     identity: IdentityParams = IdentityParams()
+    clock: ClockParams = ClockParams()
 
     def __post_init__(self) -> None:
         if len(self.sources) > MAX_SOURCES:
