@@ -51,12 +51,12 @@ def test_sources_are_taken_as_declared_and_identities_go_out(ros_context: Any) -
         for name in names:
             diagnostics.wait_for(name, lambda v: v.get("active") == "True", f"{name} to be active")
 
-        def answered(count: int, now_ns: int) -> None:
+        def answered(now_ns: int) -> None:
             def all_there() -> bool:
                 tick.publish(clock(now_ns))
-                return all(len(got) >= count for got in fused.values())
+                return all(got and stamp_ns(got[-1]) == now_ns for got in fused.values())
 
-            probe.wait_for(all_there, STEP_S, f"answer {count}")
+            probe.wait_for(all_there, STEP_S, f"the answer of {now_ns}")
 
         def published(source: str, at_ns: int, *means: list[float]) -> None:
             ahead_ns = round(OFFSET_S * SECOND_NS) if source == "right" else 0
@@ -64,7 +64,7 @@ def test_sources_are_taken_as_declared_and_identities_go_out(ros_context: Any) -
 
         tick.publish(clock(FIRST_NS))
         published("right", FIRST_NS, [0.0, 0.0, 0.0, 0.0])  # starts nothing, and is no stamp of the future
-        answered(1, FIRST_NS)
+        answered(FIRST_NS)
         assert [m[-1].width for m in fused.values()] == [0] * 3
         assert {stamp_ns(m[-1]) for m in fused.values()} == {FIRST_NS}
         second_ns = FIRST_NS + SECOND_NS // 10
@@ -73,12 +73,13 @@ def test_sources_are_taken_as_declared_and_identities_go_out(ros_context: Any) -
         for name, counts in diagnostics_of.items():
             diagnostics.wait_for_counts(name, counts)
         published("left", second_ns, [0.0, 0.0, 0.0, 0.0], [50.0, 0.0, 0.0, 0.0])
-        answered(2, second_ns)
+        answered(second_ns)
         third_ns = second_ns + SECOND_NS  # the scan of left is too old by then
         published("right", third_ns, [0.0, 0.0, 0.0, 0.0])
-        answered(3, third_ns)
+        answered(third_ns)
 
         for name, tables in fused.items():
+            assert [stamp_ns(table) for table in tables] == [FIRST_NS, second_ns, third_ns]
             rows = read(tables[-1])
             assert rows.source.tolist() == [2, 0]
             np.testing.assert_allclose(np.diag(rows.cov[0, 0]), [11.0, 11.0, 2.0, 2.0])
@@ -87,10 +88,14 @@ def test_sources_are_taken_as_declared_and_identities_go_out(ros_context: Any) -
             assert before.uuid is not None
             assert rows.uuid.tolist() == before.uuid.tolist()
             assert {u[6] >> 4 for u in rows.uuid.tolist()} == {5}  # the version
-            probe.wait_for(lambda name=name: odometry[name] and markers[name], STEP_S, f"all of {name}")  # type: ignore[misc]
             ids = set(rows.track_id.tolist())
+
+            def all_there(name: str = name, ids: set[int] = ids) -> bool:
+                own = {m.child_frame_id for m in odometry[name]}
+                return own == set(map(str, ids)) and len(markers[name]) == 3
+
+            probe.wait_for(all_there, STEP_S, f"all of {name}")
             assert {track_id_of(m.child_frame_id) for m in odometry[name]} == ids
-            assert {m.child_frame_id for m in odometry[name]} == set(map(str, ids))
             assert {m.id for m in markers[name][-1].markers[1:]} == ids
         given, own, other = (read(fused[name][-1]) for name in names)
         assert given.track_id.tolist() == [1, 2]
