@@ -14,10 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from nav_msgs.msg import Odometry
 
-from msg_adapters.arrays import CrossBlock, Floats, MessageError, TrackArrays
+from msg_adapters.arrays import CrossBlock, Floats, MessageError
 from msg_adapters.header import NS_PER_S, make_header
 from msg_adapters.odometry import missing_child_frame, track_id_of, tracks_of, values_of
 from msg_adapters.orientation import bad_orientation
+from msg_adapters.types import RawReading, RawScan
 
 #: Position 3, orientation 4, covariance 36; linear and angular velocity 6, covariance 36.
 _DOUBLES = 85
@@ -31,22 +32,6 @@ class RawMessage(NamedTuple):
     frame_id: str
     child_frame_id: str
     values: Floats
-
-
-class RawScan(NamedTuple):
-    """The tracks of messages of one stamp and frame, in the order in which they came."""
-
-    stamp_ns: int
-    frame_id: str
-    tracks: TrackArrays
-
-
-class RawReading(NamedTuple):
-    """Scans in the order of their first messages; errors; of how many tracks the position-velocity block is absent."""
-
-    scans: list[RawScan]
-    errors: list[MessageError]
-    supplied: int
 
 
 def odometry_from_raw(

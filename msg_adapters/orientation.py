@@ -73,7 +73,7 @@ def yaw_rotations(yaw: Floats) -> Floats:
 
 def rotation_matrix(x: float, y: float, z: float, w: float) -> Floats:
     """Return the rotation (3, 3) of a unit quaternion."""
-    return rotation_matrices(np.array([[x, y, z, w]]))[0]
+    return np.asarray(rotation_matrices(np.array([[x, y, z, w]]))[0])
 
 
 def rotation_matrices(unit: Floats) -> Floats:

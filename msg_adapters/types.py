@@ -7,7 +7,7 @@ import importlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from msg_adapters.arrays import CrossBlock, TrackArrays
+from msg_adapters.arrays import CrossBlock, MessageError, TrackArrays
 
 
 class Reading(NamedTuple):
@@ -15,6 +15,22 @@ class Reading(NamedTuple):
 
     tracks: TrackArrays
     supplied: bool = False
+
+
+class RawScan(NamedTuple):
+    """The tracks of messages of one stamp and frame, in the order in which they came."""
+
+    stamp_ns: int
+    frame_id: str
+    tracks: TrackArrays
+
+
+class RawReading(NamedTuple):
+    """Scans in the order of their first messages; errors; of how many tracks something was supplied."""
+
+    scans: list[RawScan]
+    errors: list[MessageError]
+    supplied: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +43,8 @@ class MessageType:
     read : callable      (message, axes wanted, what stands for a position-velocity block that is absent) -> Reading;
                          raises MessageError for what is malformed
     whole_scan : bool    a message holds all tracks of its stamp; else one track, and a later stamp ends the scan
+    read_raw : callable  the same of many serialised messages at once, for what comes in pieces; None: they are decoded
+                         one by one
     lacks : str          what a message cannot carry, under which readings that supply it are counted; empty: nothing
     """
 
@@ -34,6 +52,7 @@ class MessageType:
     read: Callable[[Any, Sequence[str], CrossBlock], Reading]
     whole_scan: bool = True
     lacks: str = ""
+    read_raw: Callable[[Sequence[bytes], Sequence[str], CrossBlock], RawReading] | None = None
 
     def load(self) -> type:
         """Import the class of the messages; raise as message_class does."""
@@ -69,8 +88,16 @@ def _read_odometry(msg: Any, axes: Sequence[str], cross_block: CrossBlock) -> Re
     return Reading(*odometry_from_msg(msg, axes, cross_block))
 
 
+def _read_raw_odometry(messages: Sequence[bytes], axes: Sequence[str], cross_block: CrossBlock) -> RawReading:
+    from msg_adapters.odometry_raw import odometry_from_raw
+
+    return odometry_from_raw(messages, axes, cross_block)
+
+
 #: Ours by key: what `source_types` may hold.
 MESSAGE_TYPES: Mapping[str, MessageType] = {
     "track_table": MessageType("sensor_msgs/msg/PointCloud2", _read_table),
-    "odometry": MessageType("nav_msgs/msg/Odometry", _read_odometry, whole_scan=False, lacks="cross_block"),
+    "odometry": MessageType(
+        "nav_msgs/msg/Odometry", _read_odometry, whole_scan=False, lacks="cross_block", read_raw=_read_raw_odometry
+    ),
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from nav_msgs.msg import Odometry
@@ -13,11 +13,11 @@ from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from msg_adapters.arrays import CrossBlock
-from msg_adapters.header import check_header
+from msg_adapters.header import check_header, make_header
 from msg_adapters.markers import markers_to_msg
 from msg_adapters.odometry import odometry_to_msgs
 from msg_adapters.track_table import track_table_to_msg
-from msg_adapters.types import MESSAGE_TYPES, MessageType
+from msg_adapters.types import MESSAGE_TYPES, MessageType, RawReading, RawScan
 from track_fusion.centre.centre import FusionCentre
 from track_fusion.centre.config import (
     MAX_SOURCES,
@@ -44,6 +44,10 @@ from track_fusion.tracks import SECOND_NS, TrackBatch
 SOURCE_TYPES: Registry[MessageType] = Registry("track_fusion.adapters", "source type", MessageType, MESSAGE_TYPES)
 #: How often silent sources are looked at, in ROS time; scans that wait are, when their time has come.
 LOOK_PERIOD_S = 0.02
+#: So many pieces of scans a source's queue holds, and are read at once.
+PIECES = 1000
+
+RawReader = Callable[[Sequence[bytes], Sequence[str], CrossBlock], RawReading]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,14 +118,18 @@ class FusionCentreNode(ManagedNode):
         self._tracks = self.publisher(PointCloud2, "~/tracks", expected=self.managed.expected_subscribers)
         self._odometry = self.publisher(Odometry, "~/odometry")
         self._markers = self.publisher(MarkerArray, "~/markers")
+        self._inputs: dict[int, Any] = {}
         for k, (name, kind) in enumerate(zip(self.sources.source_configurations, self.kinds, strict=True)):
             try:
                 message = kind.load()
             except ImportError as error:
                 raise ParameterError(f"The 'source_types' parameter: {error}") from error
-            depth = 10 if kind.whole_scan else 1000  # of a scan in pieces, each is a message
+            depth = 10 if kind.whole_scan else PIECES  # of a scan in pieces, each is a message
             lost = SubscriptionEventCallbacks(message_lost=self._on_lost)
-            self.subscribe(message, f"~/sources/{name}/tracks", self._reader(k, kind), depth, event_callbacks=lost)
+            reader = self._reader(k, kind) if kind.read_raw is None else self._raw_reader(k, kind, kind.read_raw)
+            raw = kind.read_raw is not None
+            topic = f"~/sources/{name}/tracks"
+            self._inputs[k] = self.subscribe(message, topic, reader, depth, event_callbacks=lost, raw=raw)
         self._timer = self.create_timer(LOOK_PERIOD_S, self._on_timer)
 
     def on_start(self) -> None:
@@ -136,26 +144,50 @@ class FusionCentreNode(ManagedNode):
             {"lost_in_transport": event.total_count_change}, "a queue was full: raise its depth by a QoS override"
         )
 
-    def _reader(self, source: int, kind: MessageType) -> Callable[[Any], None]:
-        cross_block: CrossBlock = "conservative" if self.sources.cross_block == "conservative" else "block_diagonal"
+    @property
+    def _cross_block(self) -> CrossBlock:
+        return "conservative" if self.sources.cross_block == "conservative" else "block_diagonal"
 
+    def _reader(self, source: int, kind: MessageType) -> Callable[[Any], None]:
         def read(msg: Any) -> None:
             now = self.now_ns()
             stamp_ns = check_header(
                 msg.header, frame_id=self.frame.frame_id, now_ns=now, max_future_ns=self.frame.max_future_ns
             )
-            tracks, supplied = kind.read(msg, self.centre.config.layout.axes, cross_block)
+            tracks, supplied = kind.read(msg, self.centre.config.layout.axes, self._cross_block)
             if kind.lacks:
                 self.counted[f"{kind.lacks}_absent"] += supplied
             self._take(source, screened_tracks(self, tracks, self.centre.config.layout), stamp_ns, now)
+            self._advance(now)
 
         return read
+
+    def _raw_reader(self, source: int, kind: MessageType, read_raw: RawReader) -> Callable[[bytes], None]:
+        """Read at once what has come, so that a scan of many pieces costs no callback and no decoding each."""
+
+        def read(first: bytes) -> None:
+            now, axes = self.now_ns(), self.centre.config.layout.axes
+            reading = read_raw([first, *self.drained(self._inputs[source], PIECES)], axes, self._cross_block)
+            self.counted[f"{kind.lacks}_absent"] += reading.supplied
+            for error in reading.errors:
+                self.reject({error.reason: 1}, str(error))
+            for scan in reading.scans:
+                self._handle(lambda scan: self._take_raw(source, scan, now), scan)
+            self._advance(now)
+
+        return read
+
+    def _take_raw(self, source: int, scan: RawScan, now_ns: int) -> None:
+        check_header(
+            make_header(scan.stamp_ns, scan.frame_id), frame_id=self.frame.frame_id, now_ns=now_ns,
+            max_future_ns=self.frame.max_future_ns,
+        )  # fmt: skip
+        self._take(source, screened_tracks(self, scan.tracks, self.centre.config.layout), scan.stamp_ns, now_ns)
 
     def _take(self, source: int, scan: TrackBatch, stamp_ns: int, now_ns: int) -> None:
         if reason := self.centre.receive(source, scan, stamp_ns, now_ns):
             name = self.sources.source_configurations[source]
             self.reject({reason: 1}, f"a scan of {name} stamped {stamp_ns / 1e9:.3f} s")
-        self._advance(now_ns)
 
     def _on_timer(self) -> None:
         if self.active and self.released:
