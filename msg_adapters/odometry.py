@@ -11,11 +11,9 @@ from __future__ import annotations
 import re
 import zlib
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-from geometry_msgs.msg import Point, Pose, PoseWithCovariance, Twist, TwistWithCovariance, Vector3
-from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 
 from msg_adapters.arrays import CrossBlock, Floats, MergedLike, MessageError, TrackArrays, slots_of
@@ -28,6 +26,9 @@ from msg_adapters.orientation import (
     yaw_rotations,
     yaws,
 )
+
+if TYPE_CHECKING:
+    from nav_msgs.msg import Odometry
 
 #: Where an axis stands in the message: 0 to 5 the pose, 6 to 11 the twist.
 _SLOT = {"x": 0, "y": 1, "z": 2, "yaw": 5, "vx": 6, "vy": 7, "vz": 8, "turn_rate": 11}
@@ -241,6 +242,9 @@ def _check_parameters(cross_block: str, cross_weight: float, twist_frame: str) -
 
 def _message(frame: str, child: str, stamp_ns: int, mean: list[float], cov: Floats, yaw: float) -> Odometry:
     """Build one message from a full state, the twist in the body frame."""
+    from geometry_msgs.msg import Point, Pose, PoseWithCovariance, Twist, TwistWithCovariance, Vector3
+    from nav_msgs.msg import Odometry
+
     pose = Pose(position=Point(x=mean[0], y=mean[1], z=mean[2]), orientation=from_yaw(yaw))
     twist = Twist(linear=Vector3(x=mean[6], y=mean[7], z=mean[8]), angular=Vector3(x=mean[9], y=mean[10], z=mean[11]))
     # Contiguous copies: a reshaped view would keep the whole batch alive.

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from msg_adapters.arrays import CrossBlock, MessageError, TrackArrays
+from msg_adapters.arrays import CrossBlock, RawReading, TrackArrays
+from msg_adapters.classes import message_class
 
 
 class Reading(NamedTuple):
@@ -15,22 +15,6 @@ class Reading(NamedTuple):
 
     tracks: TrackArrays
     supplied: bool = False
-
-
-class RawScan(NamedTuple):
-    """The tracks of messages of one stamp and frame, in the order in which they came."""
-
-    stamp_ns: int
-    frame_id: str
-    tracks: TrackArrays
-
-
-class RawReading(NamedTuple):
-    """Scans in the order of their first messages; errors; of how many tracks something was supplied."""
-
-    scans: list[RawScan]
-    errors: list[MessageError]
-    supplied: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,23 +41,6 @@ class MessageType:
     def load(self) -> type:
         """Import the class of the messages; raise as message_class does."""
         return message_class(self.message)
-
-
-def message_class(name: str) -> type:
-    """Import the class of a type such as sensor_msgs/msg/PointCloud2.
-
-    Raises
-    ------
-    ImportError    its package is not installed, or has no such message
-    """
-    package, _, kind = name.partition("/msg/")
-    try:
-        return getattr(importlib.import_module(f"{package}.msg"), kind)  # type: ignore[no-any-return]
-    except (ImportError, AttributeError) as error:
-        apt = f"ros-jazzy-{package.replace('_', '-')}"
-        raise ImportError(
-            f"Messages of the type {name} need the package '{package}' ({error}). Install {apt}."
-        ) from error
 
 
 def _read_table(msg: Any, axes: Sequence[str], cross_block: CrossBlock) -> Reading:

@@ -12,6 +12,7 @@ from track_fusion.centre.centre import FusionCentre
 from track_fusion.centre.config import (
     CentreConfig,
     FusionCentreParams,
+    IdentityParams,
     ScanBufferParams,
     SourceConfig,
     TrackManagerParams,
@@ -31,7 +32,8 @@ def fusion_centre(**buffer):
     rule, motion = RULES["covariance_intersection"], NearlyConstantVelocity(LAYOUT, MotionParams(process_noise=5.0))
     manager = TrackManagerParams(confirmation_threshold=(1, 1), max_coast_s=MAX_COAST_S)
     sources, params = (SourceConfig("a"), SourceConfig("b")), FusionCentreParams(max_scan_age_s=0.3)
-    config = CentreConfig(sources, motion, "map", rule, rule.params(), params, manager, ScanBufferParams(**buffer))
+    waits, identity = ScanBufferParams(**buffer), IdentityParams("test")
+    config = CentreConfig(sources, motion, "map", rule, rule.params(), params, manager, waits, identity=identity)
     return FusionCentre(config)
 
 
@@ -143,7 +145,7 @@ def test_a_large_one_starts_anew_and_identifiers_go_on_counting():
         (result,) = own.advance(now)
         assert (own.resets, result.tracks.track_id.tolist(), result.time_ns) == (resets, ids, now)
     own.reset()
-    assert (own.resets, own.state.central.next_id, own.buffer.silence_s(0, SECOND)) == (2, 4, -1.0)
+    assert (own.resets, own.state.central.identities.births, own.buffer.silence_s(0, SECOND)) == (2, 4, -1.0)
 
 
 def test_a_result_is_made_when_it_is_asked_for():

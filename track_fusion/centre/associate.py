@@ -32,9 +32,9 @@ class Association:
 
 
 def associate(config: CentreConfig, pool: Pool, fresh: Bools) -> Association:
-    """Associate the source tracks of a pool; only those of new scans, `fresh` (S,), start central tracks."""
+    """Associate the source tracks of a pool; only those of new scans, `fresh` (S,), that may start central tracks."""
     sole = config.params.association == "single_target"
-    target, births = _sole_target(pool, fresh) if sole else _nearest(config, pool, fresh)
+    target, births = _sole_target(pool, fresh & config.can_initiate) if sole else _nearest(config, pool, fresh)
     member = np.flatnonzero(target >= 0)
     target = target[member]
     old = target[target < len(pool.tracks) - len(pool.source)] if config.params.memory else target[:0]
@@ -55,9 +55,9 @@ def _nearest(config: CentreConfig, pool: Pool, fresh: Bools) -> tuple[Rows, int]
     for k in np.unique(pool.source[leftover]):
         left = leftover[pool.source[leftover] == k]
         joined = nearest_neighbour(mean[left], cov[left], mean[starters], cov[starters], gamma, *axes)
-        starts = joined < 0
+        starts = (joined < 0) & config.can_initiate[k]
         joined[starts] = len(starters) + np.arange(starts.sum())
-        target[left] = count + joined
+        target[left] = np.where(joined >= 0, count + joined, -1)
         starters = np.append(starters, left[starts])
     return target, len(starters)
 

@@ -10,10 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from track_fusion.centre.config import CentreConfig, ScanBufferParams
+from track_fusion.centre.rhythm import STAMPS_KEPT, period_ns
 from track_fusion.tracks import SECOND_NS, TrackBatch
 
-#: So many stamps of a source tell its period: their median difference bears a few lost or jumping ones.
-STAMPS_KEPT = 9
 #: A source is due this share of a period after its last scan: stamps jitter.
 DUE_SHARE = 0.9
 
@@ -101,12 +100,6 @@ class Step(NamedTuple):
     late: tuple[tuple[int, TrackBatch, int], ...] = ()
 
 
-def period_ns(queue: Queue) -> int:
-    """Tell the period of a source, the median difference of its stamps, 0 = unknown yet."""
-    gaps = sorted(b - a for a, b in zip(queue.stamps, queue.stamps[1:], strict=False))
-    return gaps[len(gaps) // 2] if gaps else 0
-
-
 def add(
     config: CentreConfig, buffer: ScanBuffer, source: int, scan: TrackBatch, stamp_ns: int, now_ns: int
 ) -> tuple[ScanBuffer, str | None]:
@@ -125,13 +118,17 @@ def add(
     -------
     ScanBuffer
     str or None    `stale_scan`, `out_of_order_scan`, `duplicate_scan`, `late_scan`, `duplicate_track_id` (of a piece
-                   those tracks alone are turned away that its scan has already)
+                   those tracks alone are turned away that its scan has already), `too_many_tracks` (of pieces put
+                   together, too; as if the source had not been heard)
     """
     queue = buffer.queues[source]
     reason = _refusal(config.buffer, buffer, queue, stamp_ns, now_ns)
     if reason is None:
         assembles = config.sources[source].assembles
         queue, reason = _taken_in(assembles, queue, Waiting(stamp_ns, now_ns, now_ns, scan))
+    most = config.sources[source].settings.max_tracks_per_scan
+    if reason is None and any(len(waiting.scan) > most for waiting in queue.waiting):
+        return buffer, "too_many_tracks"
     queues = list(buffer.queues)
     if reason is None:
         # The silence of sources that were never heard begins with the first scan of any.
@@ -205,12 +202,14 @@ def all_silent(config: CentreConfig, buffer: ScanBuffer, now_ns: int) -> bool:
 
 
 def wake_ns(config: CentreConfig, buffer: ScanBuffer, now_ns: int) -> int | None:
-    """Return when time alone may make a step due, coasting aside; None: only another scan can."""
+    """Return when time alone may make a step due; None: only another scan can."""
     return min((time_ns for time_ns in _deadlines(config, buffer, now_ns) if time_ns > now_ns), default=None)
 
 
 def _deadlines(config: CentreConfig, buffer: ScanBuffer, now_ns: int) -> Iterator[int]:
-    params = config.buffer
+    params, timeout_ns = config.buffer, round(config.buffer.source_timeout_s * SECOND_NS)
+    heard = [queue.heard_ns for queue in buffer.queues if queue.heard_ns >= 0]
+    yield from (since_ns + timeout_ns for since_ns in (*heard, *([buffer.fused_ns] if heard else ())))
     if params.trigger == "rate":
         period = round(SECOND_NS / params.output_rate_hz)
         yield (now_ns // period + 1) * period
@@ -282,7 +281,7 @@ def _is_complete(config: CentreConfig, buffer: ScanBuffer, time_ns: int, now_ns:
 
 
 def _is_due(queue: Queue, newest_ns: int, time_ns: int) -> bool:
-    period = period_ns(queue)
+    period = period_ns(queue.stamps)
     return period > 0 and time_ns - newest_ns >= DUE_SHARE * period
 
 

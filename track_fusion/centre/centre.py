@@ -47,10 +47,9 @@ class FusionCentre:
         self.state, self.buffer = CentreState.initial(config), ScanBuffer.empty(config)
 
     def reset(self) -> None:
-        """Forget all tracks and scans; identifiers go on counting."""
-        fresh = CentreState.initial(self.config)
-        central = dataclasses.replace(fresh.central, next_id=self.state.central.next_id)
-        self.state, self.buffer = dataclasses.replace(fresh, central=central), ScanBuffer.empty(self.config)
+        """Forget all tracks and scans; identities go on, so that none is given again."""
+        given = self.state.central.identities
+        self.state, self.buffer = CentreState.initial(self.config, given), ScanBuffer.empty(self.config)
 
     @property
     def tracks(self) -> TrackBatch:
@@ -64,9 +63,14 @@ class FusionCentre:
         return published, info
 
     def receive(self, source: int, scan: TrackBatch, stamp_ns: int, now_ns: int) -> str | None:
-        """Take in a scan; return None, or why it was turned away: see :func:`track_fusion.centre.buffer.add`."""
+        """Take in a scan; return None, or why it was turned away: see :func:`track_fusion.centre.buffer.add`.
+
+        Here its stamps, as the source tells them, become those of the centre's clock: later by its `time_offset_s`.
+        """
         self._heed(now_ns)
-        self.buffer, reason = buffer.add(self.config, self.buffer, source, scan, stamp_ns, now_ns)
+        offset_ns = self.config.sources[source].settings.time_offset_ns
+        scan = scan.replace(time_ns=scan.time_ns + offset_ns) if offset_ns else scan
+        self.buffer, reason = buffer.add(self.config, self.buffer, source, scan, stamp_ns + offset_ns, now_ns)
         return reason
 
     def advance(self, now_ns: int) -> Iterator[Published]:
