@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bags.test_fuse import GOLDEN, SENSORS, params_file
+from bags.support import GOLDEN, SENSORS, params_file
 from nodes.support import START_S, STEP_S, Diagnostics, read
 from ros_helpers import NodeProcess, Probe
 from sensor_msgs.msg import PointCloud2
