@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from msg_adapters.arrays import CrossBlock
-from msg_adapters.header import check_header
+from msg_adapters.arrays import CrossBlock, MessageError, TrackArrays
+from msg_adapters.header import check_header, make_header
 from msg_adapters.types import MESSAGE_TYPES, MessageType
 from track_fusion.centre.centre import FusionCentre, Published
 from track_fusion.centre.config import (
@@ -154,18 +154,44 @@ class MessageCentre:
         MessageError    it cannot be read; nothing was taken
         """
         yield from self.advance(now_ns)
-        layout, kind = self.centre.config.layout, self.sources[source].kind
-        offset_ns = self.centre.config.sources[source].settings.time_offset_ns
-        stamp_ns = check_header(  # by the source's clock
-            msg.header, frame_id=self.frame.frame_id, now_ns=now_ns - offset_ns, max_future_ns=self.frame.max_future_ns
-        )
-        arrays, supplied = kind.read(msg, layout.axes, self._cross_block)
+        kind = self.sources[source].kind
+        stamp_ns = self._stamp_of(source, msg.header, now_ns)
+        arrays, supplied = kind.read(msg, self.centre.config.layout.axes, self._cross_block)
         if kind.lacks:
             self.counts.counted[f"{kind.lacks}_absent"] += supplied
-        scan = screened_tracks(self.counts, arrays, layout)
+        self._receive(source, arrays, stamp_ns, now_ns)
+        yield from self.advance(now_ns)
+
+    def take_raw(self, source: int, messages: Sequence[bytes], now_ns: int) -> Iterator[Published]:
+        """Take serialised messages of a source whose type is read so, as `take` does one after the other.
+
+        What cannot be read is counted and harms no other.
+        """
+        yield from self.advance(now_ns)
+        kind = self.sources[source].kind
+        if kind.read_raw is None:
+            raise ValueError(f"Messages of the type {kind.message} must be decoded. Got bytes.")
+        reading = kind.read_raw(messages, self.centre.config.layout.axes, self._cross_block)
+        self.counts.counted[f"{kind.lacks}_absent"] += reading.supplied
+        for error in reading.errors:
+            self.counts.reject({error.reason: 1}, str(error))
+        for scan in reading.scans:
+            try:
+                header = make_header(scan.stamp_ns, scan.frame_id)
+                self._receive(source, scan.tracks, self._stamp_of(source, header, now_ns), now_ns)
+            except MessageError as error:
+                self.counts.reject({error.reason: len(scan.tracks.track_id)}, str(error))
+        yield from self.advance(now_ns)
+
+    def _stamp_of(self, source: int, header: Any, now_ns: int) -> int:
+        """Return the stamp of a header that passes, by the source's clock."""
+        now_ns -= self.centre.config.sources[source].settings.time_offset_ns
+        return check_header(header, frame_id=self.frame.frame_id, now_ns=now_ns, max_future_ns=self.frame.max_future_ns)
+
+    def _receive(self, source: int, arrays: TrackArrays, stamp_ns: int, now_ns: int) -> None:
+        scan = screened_tracks(self.counts, arrays, self.centre.config.layout)
         if reason := self.centre.receive(source, scan, stamp_ns, now_ns):
             self.counts.reject({reason: 1}, f"a scan of {self.sources[source].name} stamped {stamp_ns / 1e9:.3f} s")
-        yield from self.advance(now_ns)
 
     def advance(self, now_ns: int) -> Iterator[Published]:
         """Run the steps that are due by now, one whenever the next result is asked for; count what happened.

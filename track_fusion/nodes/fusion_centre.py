@@ -27,6 +27,8 @@ from track_fusion.tracks import SECOND_NS, TrackBatch
 
 #: How often waiting scans and silent sources are looked at, in ROS time.
 LOOK_PERIOD_S = 0.02
+#: So many pieces of scans a source's queue holds, and are read at once.
+PIECES = 1000
 
 
 class FusionCentreNode(ManagedNode):
@@ -44,6 +46,7 @@ class FusionCentreNode(ManagedNode):
         self._tracks = self.publisher(PointCloud2, "~/tracks", expected=self.managed.expected_subscribers)
         self._odometry = self.publisher(Odometry, "~/odometry")
         self._markers = self.publisher(MarkerArray, "~/markers")
+        self._inputs: dict[int, Any] = {}
         matched = PublisherEventCallbacks(matched=self._tell_count)
         self._processed = self.create_publisher(UInt64, "~/processed", qos(1, latched=True), event_callbacks=matched)
         for k, source in enumerate(self.messages.sources):
@@ -51,9 +54,10 @@ class FusionCentreNode(ManagedNode):
                 message = source.kind.load()
             except ImportError as error:
                 raise ParameterError(f"The 'source_types' parameter: {error}") from error
-            depth = 10 if source.kind.whole_scan else 1000  # of a scan in pieces, each is a message
-            lost = SubscriptionEventCallbacks(message_lost=self._on_lost)
-            self.subscribe(message, source.topic, partial(self._take, k), depth, event_callbacks=lost)
+            depth = 10 if source.kind.whole_scan else PIECES  # of a scan in pieces, each is a message
+            lost, raw = SubscriptionEventCallbacks(message_lost=self._on_lost), source.kind.read_raw is not None
+            take = partial(self._take_raw if raw else self._take, k)
+            self._inputs[k] = self.subscribe(message, source.topic, take, depth, event_callbacks=lost, raw=raw)
         self._timer = self.create_timer(LOOK_PERIOD_S, self._on_timer)
 
     def on_start(self) -> None:
@@ -69,10 +73,19 @@ class FusionCentreNode(ManagedNode):
         )
 
     def _take(self, source: int, msg: Any) -> None:
+        self._publish_of(self.messages.take(source, msg, self.now_ns()), 1)
+
+    def _take_raw(self, source: int, first: bytes) -> None:
+        """Take at once all that waits, so that a scan of many pieces costs no callback and no decoding each."""
+        messages = [first, *self.drained(self._inputs[source], PIECES)]
+        self._publish_of(self.messages.take_raw(source, messages, self.now_ns()), len(messages))
+
+    def _publish_of(self, results: Iterator[Published], messages: int) -> None:
+        """Publish what some messages made due, and count them as handled."""
         try:
-            self._publish_all(self.messages.take(source, msg, self.now_ns()))
+            self._publish_all(results)
         finally:
-            self._handled += 1
+            self._handled += messages
             if self._processed.get_subscription_count():
                 self._tell_count()
 

@@ -6,7 +6,7 @@ import sys
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import rclpy.utilities
@@ -206,6 +206,15 @@ class ManagedNode(LifecycleNode):
             kind, topic, guarded, qos(depth),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(), **kwargs,
         )  # fmt: skip
+
+    def drained(self, subscription: Any, limit: int) -> Iterator[Any]:
+        """Take the messages that wait in a subscription, at most so many; none while older ones are held back."""
+        for _ in range(0 if self._held else limit):
+            with subscription.handle:
+                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            if taken is None:
+                return
+            yield taken[0]
 
     def _handle(self, handle: Callable[[Any], None], msg: Any) -> None:
         try:
