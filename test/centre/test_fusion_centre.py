@@ -85,6 +85,7 @@ def test_random_scenes_equal_the_oracle(seed, count, memory):
     assert min(margins["gate"] + margins["assignment"], default=1.0) > 1e-9, "a decision hangs on rounding"
 
     given = {k: getattr(settings, k) for k in ("gate_probability", "max_scan_age_s", "memory")}
+    given |= {"keep_probability": settings.gate_probability, "patience": 0, "merge_duplicates": "off"}
     manager = TrackManagerParams(**{k: getattr(settings, k) for k in TrackManagerParams.__dataclass_fields__})
     motion = MotionParams(noise_form="piecewise_constant", process_noise=settings.process_noise)
     rule_params = ArithmeticAverageParams(criterion="uniform") if rule is arithmetic_average else None

@@ -32,7 +32,7 @@ def manage(
     Parameters
     ----------
     params : TrackManagerParams
-    before : CentralTracks    the old ones
+    before : CentralTracks    the old ones, with the links of this step
     fused : Fused             the old ones in their order, then the newborn (their track_id is given here), T
     member : (T, S)           which source has a member in which track
     fresh : (S,)              which source delivered a new scan
@@ -55,6 +55,7 @@ def manage(
         fused.tracks.replace(track_id=ids, status=confirmed * np.uint8(CONFIRMED) + coasted * np.uint8(COASTED)),
         fused.has, history, _grown(before.updates, new) + fresh, _grown(before.hit_ever, new) | hit,
         np.where(supported_ns >= 0, supported_ns, _grown(before.supported_ns, new)), before.next_id + new,
+        before.links, before.twins,
     )  # fmt: skip
     dead = coasted & _expired(params, after) if coasted.any() else coasted
     changes = Changes(ids[len(before) :], ids[confirmed & ~was_confirmed & ~dead], ids[dead])
