@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -204,7 +205,7 @@ def crowd(rng: np.random.Generator, seconds: float, period_s: float, beside_m: f
 
 def crossing(speed: float, period_s: float = 0.1, gap_m: float = 1.0) -> Targets:
     """Two targets that meet head-on, so far apart across, and go on straight for as long again."""
-    seconds = 2 * (5.0 + 10.0 / speed)
+    seconds = 2 * (3.0 + 6.0 / speed)
     reach = speed * seconds / 2
     start = np.array([[-reach, 0.0, speed, 0.0], [reach, gap_m, -speed, 0.0]])
     return moving(np.random.default_rng(0), start, seconds, period_s, steady=True)
@@ -212,7 +213,7 @@ def crossing(speed: float, period_s: float = 0.1, gap_m: float = 1.0) -> Targets
 
 def two_trackers(
     rng: np.random.Generator, targets: Targets, sds: tuple[float, float], staggered: bool,
-    second: Callable[[Reports], Reports] = lambda told: told, **of_second: float,
+    second: Callable[[Reports], Reports] = lambda told: told, **of_second: Any,
 ) -> Scene:  # fmt: skip
     """Let two Kalman trackers see the targets; what the second tells is changed by `second`."""
     first = (0, int(staggered))
