@@ -68,10 +68,19 @@ def random_scans(rng, sources):
     return scans
 
 
+#: One gate alone; links and duplicates as by default, but with little patience; a centre for sources that split targets.
+IDENTITY = {
+    "one gate": {"keep_probability": 1e-6, "patience": 0, "merge_duplicates": "off"},
+    "links": {"keep_probability": 0.9999, "patience": 2, "merge_duplicates": "across_sources"},
+    "shared": {"keep_probability": 0.9999, "patience": 1, "merge_duplicates": "also_within_a_source"},
+}
+
+
+@pytest.mark.parametrize("identity", IDENTITY)
 @pytest.mark.parametrize("memory", [False, True], ids=["memoryless", "memory"])
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_random_scenes_equal_the_oracle(seed, count, memory):
+def test_random_scenes_equal_the_oracle(seed, count, memory, identity):
     rng = np.random.default_rng(1000 * count + seed)
     names = [f"sensor_{k}" for k in range(count)]
     pairs = count + memory == 2  # what the oracle's covariance intersection can do
@@ -80,12 +89,12 @@ def test_random_scenes_equal_the_oracle(seed, count, memory):
     settings = Settings(
         names, max_scan_age_s=0.15, gate_probability=(0.99, 0.7)[seed % 2], confirmation_threshold=(2, 3),
         deletion_threshold=(3, 4), max_coast_s=0.7, process_noise=2.0, memory=memory,
+        **IDENTITY[identity],
     )  # fmt: skip
     wanted, _, margins = run_centre(scans, rule, settings)
     assert min(margins["gate"] + margins["assignment"], default=1.0) > 1e-9, "a decision hangs on rounding"
 
-    given = {k: getattr(settings, k) for k in ("gate_probability", "max_scan_age_s", "memory")}
-    given |= {"keep_probability": settings.gate_probability, "patience": 0, "merge_duplicates": "off"}
+    given = {k: getattr(settings, k) for k in ("gate_probability", "max_scan_age_s", "memory", *IDENTITY[identity])}
     manager = TrackManagerParams(**{k: getattr(settings, k) for k in TrackManagerParams.__dataclass_fields__})
     motion = MotionParams(noise_form="piecewise_constant", process_noise=settings.process_noise)
     rule_params = ArithmeticAverageParams(criterion="uniform") if rule is arithmetic_average else None

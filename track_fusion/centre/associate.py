@@ -13,6 +13,9 @@ from track_fusion.centre.links import Ints, Links
 from track_fusion.centre.pool import Pool, Rows
 from track_fusion.centre.state import Bools
 
+#: Where a linked pair beyond the gate counts as lying: at the gate itself rounding would choose between it and a miss.
+JUST_INSIDE = 1.0 - 1e-9
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Association:
@@ -88,7 +91,7 @@ def _candidates(config: CentreConfig, pool: Pool, linked: Rows) -> tuple[Candida
         return near, inside
     wide = within(*tracks, stray, linked[stray], config.keep_gamma, layout.periods)
     inside[wide.row] = True
-    return joined(near, dataclasses.replace(wide, distance=np.minimum(wide.distance, config.gamma))), inside
+    return joined(near, dataclasses.replace(wide, distance=np.minimum(wide.distance, JUST_INSIDE * config.gamma))), inside
 
 
 def _assigned(config: CentreConfig, pool: Pool, near: Candidates) -> Rows:
