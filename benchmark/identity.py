@@ -86,7 +86,7 @@ def judged(tracks: Array, truth: Array) -> tuple[dict[int, int], float]:
 
 
 class Row(NamedTuple):
-    """A scene of the table: how it is made, in so many draws, from a stream and whether the second source is staggered."""
+    """A scene of the table: how it is made, from a stream and whether the second source is late, in so many draws."""
 
     make: Callable[[np.random.Generator, bool], Scene]
     draws: int = 1
@@ -182,4 +182,11 @@ def _told(results: list[Score], targets: int) -> str:
         right = sum(is_right(result, targets) for result in results)
         return f"right {right} of {len(results)}"
     (result,) = results
-    return f"ghosts {result.ghosts:.1%}, {result.ids} ids, {result.switches} switches, GOSPA {result.gospa.mean():.2f} m"
+    return (
+        f"ghosts {result.ghosts:.1%}, {result.ids} ids, {result.switches} switches, GOSPA {result.gospa.mean():.2f} m"
+    )
+
+
+if __name__ == "__main__":
+    for line in run():
+        print(f"{line.job}: {line.figure}; {line.against}", flush=True)

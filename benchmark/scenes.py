@@ -135,7 +135,11 @@ def tracked(
         p[born] = start_cov
         left = np.where(alive[k], lag, left - 1)
         known = (known | born) & (left >= 0)
-        mean[k], cov[k], told[k] = m + [bias, 0, 0, 0], claim * (p + np.swapaxes(p, 1, 2)) / 2, known & (seen | ~alive[k])
+        mean[k], cov[k], told[k] = (
+            m + [bias, 0, 0, 0],
+            claim * (p + np.swapaxes(p, 1, 2)) / 2,
+            known & (seen | ~alive[k]),
+        )
         ids[k] = np.arange(count) + 1000 * (k // restart if restart else 0)
     return Reports(mean, cov, told, ids)
 

@@ -11,15 +11,16 @@ from __future__ import annotations
 import re
 import zlib
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-from geometry_msgs.msg import Point, Pose, PoseWithCovariance, Twist, TwistWithCovariance, Vector3
-from nav_msgs.msg import Odometry
 
 from msg_adapters.arrays import CrossBlock, Floats, MergedLike, MessageError, TrackArrays, one_track, slots_of
 from msg_adapters.header import make_header, stamp_to_ns
 from msg_adapters.orientation import from_yaw, rotation_matrix, unit_quaternion, yaw_of, yaw_rotations
+
+if TYPE_CHECKING:
+    from nav_msgs.msg import Odometry
 
 #: Where an axis stands in the message: 0 to 5 the pose, 6 to 11 the twist.
 _SLOT = {"x": 0, "y": 1, "z": 2, "yaw": 5, "vx": 6, "vy": 7, "vz": 8, "turn_rate": 11}
@@ -183,6 +184,9 @@ def _check_parameters(cross_block: str, cross_weight: float, twist_frame: str) -
 
 def _message(frame: str, child: str, stamp_ns: int, mean: list[float], cov: Floats, yaw: float) -> Odometry:
     """Build one message from a full state, the twist in the body frame."""
+    from geometry_msgs.msg import Point, Pose, PoseWithCovariance, Twist, TwistWithCovariance, Vector3
+    from nav_msgs.msg import Odometry
+
     pose = Pose(position=Point(x=mean[0], y=mean[1], z=mean[2]), orientation=from_yaw(yaw))
     twist = Twist(linear=Vector3(x=mean[6], y=mean[7], z=mean[8]), angular=Vector3(x=mean[9], y=mean[10], z=mean[11]))
     # Contiguous copies: a reshaped view would keep the whole batch alive.

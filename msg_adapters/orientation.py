@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
-from geometry_msgs.msg import Quaternion
 
 from msg_adapters.arrays import Floats, MessageError
+
+if TYPE_CHECKING:
+    from geometry_msgs.msg import Quaternion
 
 #: How far the squared norm of a quaternion may be from 1; beyond, it is no orientation but an oversight.
 QUATERNION_TOLERANCE = 1e-2
@@ -39,6 +42,8 @@ def yaw_of(q: Quaternion) -> float:
 
 def from_yaw(yaw: float) -> Quaternion:
     """Return the orientation of a turn about z, rad."""
+    from geometry_msgs.msg import Quaternion
+
     return Quaternion(x=0.0, y=0.0, z=float(np.sin(yaw / 2)), w=float(np.cos(yaw / 2)))
 
 
@@ -63,6 +68,8 @@ def rotation_matrix(x: float, y: float, z: float, w: float) -> Floats:
 
 def from_matrix(r: list[list[float]]) -> Quaternion:
     """Return the orientation of a rotation matrix, by its largest component, which no cancellation spoils."""
+    from geometry_msgs.msg import Quaternion
+
     trace = r[0][0] + r[1][1] + r[2][2]
     squared = [1 + 2 * r[0][0] - trace, 1 + 2 * r[1][1] - trace, 1 + 2 * r[2][2] - trace, 1 + trace]
     big = max(range(4), key=squared.__getitem__)

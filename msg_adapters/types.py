@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from msg_adapters.arrays import CrossBlock, TrackArrays
+from msg_adapters.classes import message_class
 
 
 class Reading(NamedTuple):
@@ -38,23 +38,6 @@ class MessageType:
     def load(self) -> type:
         """Import the class of the messages; raise as message_class does."""
         return message_class(self.message)
-
-
-def message_class(name: str) -> type:
-    """Import the class of a type such as sensor_msgs/msg/PointCloud2.
-
-    Raises
-    ------
-    ImportError    its package is not installed, or has no such message
-    """
-    package, _, kind = name.partition("/msg/")
-    try:
-        return getattr(importlib.import_module(f"{package}.msg"), kind)  # type: ignore[no-any-return]
-    except (ImportError, AttributeError) as error:
-        apt = f"ros-jazzy-{package.replace('_', '-')}"
-        raise ImportError(
-            f"Messages of the type {name} need the package '{package}' ({error}). Install {apt}."
-        ) from error
 
 
 def _read_table(msg: Any, axes: Sequence[str], cross_block: CrossBlock) -> Reading:

@@ -20,8 +20,8 @@ from track_fusion.plugins import Registry
 
 if TYPE_CHECKING:
     from track_fusion.models.choices import Choice
-    from track_fusion.scenarios import Scenario
     from track_fusion.study.claim import Claim
+    from track_fusion.study.scenario import Scenario
 
 SOURCE_TREE = Path(__file__).parents[1]
 LINE_WIDTH = 120
@@ -211,37 +211,48 @@ def fusion_centre_sections() -> list[Section]:
     from track_fusion.centre.config import (
         TRACK_RULES,
         FusionCentreParams,
+        IdentityParams,
         ScanBufferParams,
+        SourceSettings,
         StateFusionParams,
         TrackManagerParams,
     )
+    from track_fusion.clock import ClockParams
+    from track_fusion.messages.centre import OneSourceParams, SourceParams
+    from track_fusion.messages.parameters import ManagedParams
+    from track_fusion.messages.screening import FrameParams
     from track_fusion.models.choices import MOTIONS, MotionChoice
-    from track_fusion.nodes.fusion_centre import SourceParams
-    from track_fusion.nodes.managed import ManagedParams
-    from track_fusion.nodes.screening import FrameParams
     from track_fusion.random_streams import RandomParams
 
     default, declared = StateFusionParams().state_fusion, "declared when state_fusion is"
     rules = {key: rule for key, rule in TRACK_RULES.own.items() if specs(rule.params)}
     return [
-        *map(Section, (FrameParams, SourceParams, MotionChoice)),
+        *map(Section, (FrameParams, SourceParams)),
+        *(
+            Section(kind, f"{name}.", title and f"{title} {name}.")
+            for name in SourceParams().source_configurations
+            for kind, title in ((OneSourceParams, "The source"), (SourceSettings, "What is declared of"))
+        ),
+        Section(MotionChoice),
         *_alternatives("motion", MOTIONS.own, MotionChoice().motion),
         *map(Section, (StateFusionParams, FusionCentreParams)),
         *(
             Section(rule.params, f"{key}.", f"{rule.title}: {declared} {key}.", declared=key == default)
             for key, rule in rules.items()
         ),
-        *map(Section, (ScanBufferParams, TrackManagerParams)),
+        *map(Section, (ScanBufferParams, TrackManagerParams, IdentityParams)),
         Section(RandomParams, title="Random numbers of rules that draw samples: seed, run and role name a stream."),
+        Section(ClockParams),
         Section(ManagedParams),
     ]
 
 
 def sensor_tracker_sections() -> list[Section]:
     """List what a sensor tracker declares; a test compares it with the node."""
+    from track_fusion.clock import ClockParams
+    from track_fusion.messages.parameters import ManagedParams
+    from track_fusion.messages.screening import FrameParams
     from track_fusion.models.choices import MOTIONS, SENSORS, Choice
-    from track_fusion.nodes.managed import ManagedParams
-    from track_fusion.nodes.screening import FrameParams
     from track_fusion.nodes.sensor_tracker import FeedbackParams, OutputParams
     from track_fusion.trackers.filters import FILTERS
     from track_fusion.trackers.many_targets import PdaTracker, PdaTrackerParams
@@ -254,7 +265,7 @@ def sensor_tracker_sections() -> list[Section]:
         *_alternatives("motion", MOTIONS.own, default.motion),
         *_alternatives("sensor", SENSORS, default.sensor),
         *_alternatives("filter", filters, default.filter),
-        *map(Section, (SensorTrackerParams, FeedbackParams, OutputParams, ManagedParams)),
+        *map(Section, (SensorTrackerParams, FeedbackParams, OutputParams, ClockParams, ManagedParams)),
     ]
 
 

@@ -24,7 +24,10 @@ FLOORS: tuple[Mapping[str, str], ...] = (
         "scenarios": "one published study a folder",
         "report": "pages and pictures",
     },
-    {"study": "what a scenario is: runs, outcomes, figures, claims and verdicts"},
+    {
+        "messages": "messages at the door: parameters, screening, a centre on messages; without ROS",
+        "study": "what a scenario is: runs, outcomes, figures, claims and verdicts",
+    },
     {"centre": "the fusion centre: a value and pure steps"},
     {"peers": "decentralised fusion"},
     {"trackers": "detections in, tracks out"},
@@ -39,12 +42,12 @@ FLOORS: tuple[Mapping[str, str], ...] = (
     {"ground": "modules outside any folder: data model, parameters, linear algebra, angles, random streams"},
 )
 #: The modules that stand on the ground, outside any folder, and the package itself.
-GROUND = frozenset({"", "angles", "layouts", "linalg", "params", "plugins", "random_streams", "tracks"})
+GROUND = frozenset({"", "angles", "clock", "layouts", "linalg", "params", "plugins", "random_streams", "tracks"})
 #: Only these rooms know ROS.
 ROS_ROOMS = frozenset({"demo", "nodes"})
 #: The adapters stand beside the house: these rooms use them, they know nothing of it.
 ADAPTERS = "msg_adapters"
-ADAPTER_USERS = frozenset({"bags", "demo", "nodes"})
+ADAPTER_USERS = frozenset({"bags", "demo", "messages", "nodes"})
 #: What belongs to ROS beside message packages: by name, or by how the name begins.
 ROS = frozenset({"ament_index_python", "diagnostic_updater", "launch", "launch_ros", "message_filters", "rclpy"})
 ROS_PREFIXES = ("rosbag2_", "rosidl_", "tf2_")

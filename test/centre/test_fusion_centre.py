@@ -9,7 +9,13 @@ from oracles.kalman import predict, update
 from scipy.stats import chi2
 
 from track_fusion.centre.centre import FusionCentre
-from track_fusion.centre.config import CentreConfig, FusionCentreParams, SourceConfig, TrackManagerParams
+from track_fusion.centre.config import (
+    CentreConfig,
+    FusionCentreParams,
+    IdentityParams,
+    SourceConfig,
+    TrackManagerParams,
+)
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
 from track_fusion.params import ParameterError
@@ -28,7 +34,8 @@ EAGER = TrackManagerParams(confirmation_threshold=(1, 1))
 def fusion_centre(sources, motion, rule, rule_params=None, params=None, **others):
     names = tuple(SourceConfig(f"source_{k}") for k in range(sources))
     params = params or FusionCentreParams()
-    return FusionCentre(CentreConfig(names, motion, "map", rule, rule_params or rule.params(), params, **others))
+    given = {"identity": IdentityParams("test")} | others
+    return FusionCentre(CentreConfig(names, motion, "map", rule, rule_params or rule.params(), params, **given))
 
 
 def centre(sources=2, rule="covariance_intersection", rule_params=None, manager=EAGER, motion=None, **params):
@@ -68,7 +75,7 @@ def random_scans(rng, sources):
     return scans
 
 
-#: One gate alone; links and duplicates as by default, but with little patience; a centre for sources that split targets.
+#: One gate alone; links and duplicates as by default, with little patience; for sources that split targets.
 IDENTITY = {
     "one gate": {"keep_probability": 1e-6, "patience": 0, "merge_duplicates": "off"},
     "links": {"keep_probability": 0.9999, "patience": 2, "merge_duplicates": "across_sources"},
@@ -95,7 +102,9 @@ def test_random_scenes_equal_the_oracle(seed, count, memory, identity):
     assert min(margins["gate"] + margins["assignment"], default=1.0) > 1e-9, "a decision hangs on rounding"
 
     given = {k: getattr(settings, k) for k in ("gate_probability", "max_scan_age_s", "memory", *IDENTITY[identity])}
-    manager = TrackManagerParams(**{k: getattr(settings, k) for k in TrackManagerParams.__dataclass_fields__})
+    manager = TrackManagerParams(
+        **{k: v for k, v in vars(settings).items() if k in TrackManagerParams.__dataclass_fields__}
+    )
     motion = MotionParams(noise_form="piecewise_constant", process_noise=settings.process_noise)
     rule_params = ArithmeticAverageParams(criterion="uniform") if rule is arithmetic_average else None
     fuser = centre(count, rule.__name__, rule_params, manager, motion, **given)
@@ -458,7 +467,8 @@ def test_a_sources_uuid_is_not_taken_for_the_central_tracks():
     uuid = np.arange(32, dtype=np.uint8).reshape(2, 16)
     batch = tracks([[0, 0], [50, 0]], 0).replace(uuid=uuid)
     fused, _ = centre().step(0, {0: batch, 1: tracks([[0, 0]], 0)})
-    assert fused.uuid is None
+    without, _ = centre().step(0, {0: batch.replace(uuid=None), 1: tracks([[0, 0]], 0)})
+    assert fused.uuid.tolist() == without.uuid.tolist()
 
 
 @pytest.mark.parametrize(

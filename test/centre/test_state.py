@@ -9,7 +9,14 @@ import pytest
 from track_fusion import tracks as tracks_module
 from track_fusion.centre import pool as pool_module
 from track_fusion.centre.associate import Association, associate
-from track_fusion.centre.config import MAX_SOURCES, CentreConfig, FusionCentreParams, SourceConfig, TrackManagerParams
+from track_fusion.centre.config import (
+    MAX_SOURCES,
+    CentreConfig,
+    FusionCentreParams,
+    IdentityParams,
+    SourceConfig,
+    TrackManagerParams,
+)
 from track_fusion.centre.fuse import fuse
 from track_fusion.centre.links import Links
 from track_fusion.centre.pool import Pool, admitted
@@ -32,7 +39,8 @@ def config(rule="covariance_intersection", sources=("a", "b"), **params):
     sources = tuple(s if isinstance(s, SourceConfig) else SourceConfig(s) for s in sources)
     manager = TrackManagerParams(confirmation_threshold=(1, 1), deletion_threshold=(2, 2))
     rule = RULES[rule]
-    return CentreConfig(sources, MOTION, "map", rule, rule.params(), FusionCentreParams(**params), manager)
+    own, identity = FusionCentreParams(**params), IdentityParams("test")
+    return CentreConfig(sources, MOTION, "map", rule, rule.params(), own, manager, identity=identity)
 
 
 def scan(rng, time_ns, count=3, components=1):

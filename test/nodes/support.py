@@ -23,15 +23,20 @@ AXES = ("x", "y", "vx", "vy")
 START_S = 60.0  # processes start slowly when the machine is busy
 STEP_S = 60.0  # far above what anything awaited here takes, on a busy machine too
 
+#: Identities of central tracks that are the same in every run.
+IDENTITY = "test"
+
 #: A centre in simulated time that runs a step only when all its sources are there: no wall clock in the result.
 PATIENT = {
     "use_sim_time": True,
     "axes": list(AXES),
+    "trigger": "all_sources",
     "fusion_timeout_s": 1000.0,
     "source_timeout_s": 10_000.0,
     "max_delay_s": 1000.0,
     "max_future_s": 10.0,
     "expected_subscribers": 1,
+    "identity_namespace": IDENTITY,  # ids count from 1
 }
 
 

@@ -139,7 +139,7 @@ def nodes(shared_domain: int, shared_probe: Probe, tmp_path_factory: pytest.Temp
     chosen: list[tuple[str, str, dict[str, Any]]] = [
         ("fusion_centre", "managed", one | {"use_sim_time": False, "autostart": False, "max_delay_s": 1e10}),
         ("fusion_centre", "neglecting", two | {"out_of_sequence": "neglect"}),
-        ("fusion_centre", "predicting", two | {"out_of_sequence": "predict"}),
+        ("fusion_centre", "predicting", two | {"out_of_sequence": "predict", "fusion_timeout_s": 0.0}),
         ("fusion_centre", "jumping_centre", one),
         ("sensor_tracker", "jumping_tracker", tracker),
         ("evaluator", "judge", {"output": str(folder / "judge.json")}),
@@ -213,10 +213,10 @@ def test_late_scans_are_neglected_or_predicted(nodes: Set) -> None:
         nodes.await_count(fused, 1, "the first step", **time)
         b.publish(scan[99])
         if name == "predicting":
-            nodes.await_count(fused, 2, "a second step at 10 s", **time)
+            nodes.await_count(fused, 2, "a second step just after 10 s", **time)
             late = read(fused[-1])
-            assert (stamp_ns(fused[-1]), late.source.tolist()) == (10 * SECOND_NS, [3])
-            np.testing.assert_allclose(late.mean[0, 0], [10.0, 0.0, 1.0, 0.0], rtol=1e-12)
+            assert (stamp_ns(fused[-1]), late.source.tolist()) == (10 * SECOND_NS + 1, [3])
+            np.testing.assert_allclose(late.mean[0, 0], [10.0 + 1e-9, 0.0, 1.0, 0.0], rtol=1e-12)
         else:
             nodes.diagnostics.wait_for_counts(name, {"late_scan": 1})
         b.publish(scan[101])
@@ -239,7 +239,7 @@ def test_a_clock_that_jumps_back_starts_the_centre_anew(nodes: Set) -> None:
     nodes.diagnostics.wait_for("jumping_centre", lambda v: v.get("clock_jumps") == "1", "the jump to be counted")
     source.publish(track_table(50 * SECOND_NS, far_apart[1:]))
     nodes.await_count(fused, 3, "a step after the jump", ticker, 50 * SECOND_NS)
-    assert (stamp_ns(fused[-1]), read(fused[-1]).track_id.tolist()) == (50 * SECOND_NS, [1])
+    assert (stamp_ns(fused[-1]), read(fused[-1]).track_id.tolist()) == (50 * SECOND_NS, [3])
     assert read(fused[-1]).mean[0, 0].tolist() == far_apart[1]
     assert nodes.diagnostics.rejected("jumping_centre") == {}
 
@@ -304,6 +304,7 @@ CENTRE = {
     "axes": list(AXES),
     "state_fusion": "covariance_intersection",
     "process_noise": 5.0,
+    "trigger": "all_sources",
     "fusion_timeout_s": 2.5,
     "source_timeout_s": 5.0,
     "max_scan_age_s": 1.5,

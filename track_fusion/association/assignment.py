@@ -97,18 +97,29 @@ def nearest_neighbour(
     return assign(candidates, len(row_mean), len(col_mean), gamma)
 
 
-def nearest_pairs(first: Array, second: Array, reach: float) -> tuple[Indices, Indices]:
+def nearest_pairs(first: Array, second: Array, reach: float, power: float = 1.0) -> tuple[Indices, Indices]:
     """Pair points one to one by least total distance, none farther apart than `reach`.
 
     Parameters
     ----------
     first, second : (M, d), (N, d)    without NaN
+    reach : float                     what a point without partner costs in place of a distance
+    power : float                     of the distances that are summed
 
     Returns
     -------
     row, col : (P,) each, ascending rows
     """
-    distance = np.linalg.norm(first[:, None] - second[None], axis=-1)
-    row, col = linear_sum_assignment(np.minimum(distance, reach))
+    return pairs_within(distances(first, second), reach, power)
+
+
+def distances(first: Array, second: Array) -> Array:
+    """Distance of each point of one set to each of the other: (M, d), (N, d) -> (M, N)."""
+    return np.asarray(np.linalg.norm(first[:, None] - second[None], axis=-1))
+
+
+def pairs_within(distance: Array, reach: float, power: float = 1.0) -> tuple[Indices, Indices]:
+    """`nearest_pairs` of points whose distances (M, N) are known."""
+    row, col = linear_sum_assignment(np.minimum(distance, reach) ** power)
     near = distance[row, col] < reach
     return row[near], col[near]

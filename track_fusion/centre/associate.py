@@ -42,9 +42,9 @@ class Association:
 
 
 def associate(config: CentreConfig, pool: Pool, links: Links, fresh: Bools) -> Association:
-    """Associate the source tracks of a pool; only those of new scans, `fresh` (S,), start central tracks."""
+    """Associate the source tracks of a pool; only those of new scans, `fresh` (S,), that may start central tracks."""
     if config.params.association == "single_target":
-        target, births = _sole_target(pool, fresh)
+        target, births = _sole_target(pool, fresh & config.can_initiate)
         return _taken(config, pool, target, births, Links.none())
     linked, idle = links.of(pool.key)
     near, inside = _candidates(config, pool, linked)
@@ -91,7 +91,8 @@ def _candidates(config: CentreConfig, pool: Pool, linked: Rows) -> tuple[Candida
         return near, inside
     wide = within(*tracks, stray, linked[stray], config.keep_gamma, layout.periods)
     inside[wide.row] = True
-    return joined(near, dataclasses.replace(wide, distance=np.minimum(wide.distance, JUST_INSIDE * config.gamma))), inside
+    near = joined(near, dataclasses.replace(wide, distance=np.minimum(wide.distance, JUST_INSIDE * config.gamma)))
+    return near, inside
 
 
 def _assigned(config: CentreConfig, pool: Pool, near: Candidates) -> Rows:
@@ -135,9 +136,9 @@ def _start(config: CentreConfig, pool: Pool, target: Rows, held: Bools, fresh: B
             mean[left], cov[left], mean[starters], cov[starters], config.gamma, config.layout.position,
             config.layout.periods,
         )  # fmt: skip
-        starts = group < 0
+        starts = (group < 0) & config.can_initiate[k]
         group[starts] = len(starters) + np.arange(starts.sum())
-        target[left] = len(central) + group
+        target[left] = np.where(group >= 0, len(central) + group, -1)
         starters = np.append(starters, left[starts])
     return len(starters)
 

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from track_fusion.clock import ClockParams
 from track_fusion.linalg import Array
 from track_fusion.models.base import Motion
 from track_fusion.models.transforms import Transform
@@ -16,10 +17,12 @@ from track_fusion.plugins import Registry
 from track_fusion.random_streams import RandomParams
 from track_fusion.rules import RULES, Rule, SourceTracks
 from track_fusion.solvers.chi_square import chi_square_quantile
-from track_fusion.tracks import StateLayout
+from track_fusion.tracks import SECOND_NS, StateLayout
 
 #: Provenance has 32 bits.
 MAX_SOURCES = 32
+#: No clock is further off: 32 bits of seconds.
+MAX_OFFSET_S = 2.0**32
 #: Updates that a history remembers: its width in bits.
 HISTORY_BITS = 32
 
@@ -97,12 +100,34 @@ class ScanBufferParams(Params):
     """When a fusion step runs and which scans are too late for it."""
 
     trigger: str = param(
-        "all_sources",
-        "all_sources: fuse once every live source has delivered a scan of that time or later; "
-        "any_source: fuse at every scan",
-        choices=("all_sources", "any_source"),
+        "any_source",
+        "any_source: a scan makes a step, which waits gather_window_s for live sources that are due at its stamp; "
+        "all_sources: a step waits until every live source has delivered a scan of its time or later; "
+        "rate: a step at each tick of output_rate_hz",
+        choices=("any_source", "all_sources", "rate"),
     )
-    fusion_timeout_s: float = param(0.1, "how long a scan waits for the other sources", unit="s", low=0.0)
+    gather_window_s: float = param(
+        0.004, "any_source: so long a step waits for sources that are due", unit="s", low=0.0
+    )
+    output_rate_hz: float = param(10.0, "rate: steps a second", unit="Hz", low=0.0, strict=True)
+    max_output_rate_hz: float = param(
+        0.0, "scans that come closer together than this allows are joined in one step; 0: no limit", unit="Hz", low=0.0
+    )
+    publish_at: str = param(
+        "stamp",
+        "stamp: tracks are published at the time of their step; now: they are predicted to the clock's time",
+        choices=("stamp", "now"),
+    )
+    assembly_window_s: float = param(
+        0.01,
+        "a scan in pieces (Odometry) is complete so long after its last piece, unless all tracks of its source's last "
+        "scan are there sooner; with all_sources: when its source's next scan begins",
+        unit="s",
+        low=0.0,
+    )
+    fusion_timeout_s: float = param(
+        0.1, "how long a scan waits for the other sources, or for a step of a later time", unit="s", low=0.0
+    )
     source_timeout_s: float = param(
         1.0,
         "after this silence a source is not waited for; when all are silent, tracks coast",
@@ -113,7 +138,7 @@ class ScanBufferParams(Params):
     max_delay_s: float = param(10.0, "a scan older than this on arrival is rejected", unit="s", low=0.0, strict=True)
     out_of_sequence: str = param(
         "predict",
-        "a scan older than the last fusion: neglect it, or keep it as its source's newest and predict it from then on",
+        "a scan older than the last step: neglect it, or predict it to the next one as its source's newest",
         choices=("neglect", "predict"),
     )
 
@@ -132,7 +157,15 @@ class TrackManagerParams(Params):
         high=HISTORY_BITS,
     )
     max_coast_s: float = param(
-        5.0, "delete a track that no source supported for so long", unit="s", low=0.0, strict=True
+        0.0,
+        "delete a track that no source supported for so long; 0: three periods of the slowest source that ever did, at "
+        "least 5 s",
+        unit="s",
+        low=0.0,
+    )
+    confirmation_sources: int = param(1, "how many sources it takes to confirm a track, each by M of N", low=1)
+    max_tentative_tracks: int = param(
+        20_000, "keep at most so many tracks that are not confirmed; the oldest are dropped and counted", low=1
     )
 
     def __post_init__(self) -> None:
@@ -143,6 +176,46 @@ class TrackManagerParams(Params):
                 raise ParameterError(f"The '{name}' parameter must be two integers, the first not larger. Got {value}.")
 
 
+@dataclasses.dataclass(frozen=True)
+class IdentityParams(Params):
+    """What central tracks are called."""
+
+    identity_namespace: str = param(
+        "",
+        "name from which the UUIDs of central tracks are made, ids counting from 1: the same in every run; empty: a "
+        "namespace drawn at start, ids counting from a number made from the time, so that no restart gives one again",
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class SourceSettings(Params):
+    """What is declared of one source."""
+
+    can_initiate: bool = param(True, "whether its tracks start central tracks")
+    covariance_scale: float = param(
+        1.0, "its covariances are multiplied by this (above 1: it claims too much)", low=0.0, high=1e6, strict=True
+    )
+    bias_sd: float = param(
+        0.0,
+        "standard deviation of its bias along each position axis, added to its covariances after scaling",
+        unit="m",
+        low=0.0,
+        high=1e6,
+    )
+    time_offset_s: float = param(
+        0.0, "added to its stamps: how far its clock is behind", unit="s", low=-MAX_OFFSET_S, high=MAX_OFFSET_S
+    )
+    max_tracks_per_scan: int = param(20_000, "a scan of more tracks is turned away whole (too_many_tracks)", low=1)
+    is_self_reported: bool = param(
+        True, "whether its tracks hold what it sensed itself and no more; false: they count as shared provenance"
+    )
+
+    @property
+    def time_offset_ns(self) -> int:
+        """The same in nanoseconds."""
+        return round(self.time_offset_s * SECOND_NS)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class SourceConfig:
     """What is known of a source of tracks.
@@ -150,14 +223,15 @@ class SourceConfig:
     Attributes
     ----------
     name : str
-    assembles : bool               its scans arrive piece by piece (one message a track), so that a scan is complete
-                                   only when a later one has begun
+    assembles : bool               its scans arrive piece by piece (one message a track)
     transform : Transform or None  from its axes and frame to the centre's; None = it has those of the centre
+    settings : SourceSettings
     """
 
     name: str
     assembles: bool = False
     transform: Transform | None = None
+    settings: SourceSettings = SourceSettings()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -175,11 +249,14 @@ class CentreConfig:
     manager : TrackManagerParams
     buffer : ScanBufferParams
     random : RandomParams              what rules that sample draw from, step after step
+    identity : IdentityParams
+    clock : ClockParams                how far the clocks may be trusted
 
     Raises
     ------
     ParameterError    too many sources; the rule needs what source tracks do not bring, such as their
-                      cross-covariance; weights are given that do not fit the sources; not one number an axis in
+                      cross-covariance; `confirmation_sources` exceeds them; weights are given that do not fit the
+                      sources; not one number an axis in
                       `particle_variances`; a transform does not bring every axis of the centre
     """
 
@@ -192,10 +269,17 @@ class CentreConfig:
     manager: TrackManagerParams = TrackManagerParams()
     buffer: ScanBufferParams = ScanBufferParams()
     random: RandomParams = RandomParams(role="fusion_centre")
+    identity: IdentityParams = IdentityParams()
+    clock: ClockParams = ClockParams()
 
     def __post_init__(self) -> None:
         if len(self.sources) > MAX_SOURCES:
             raise ParameterError(f"The 'sources' must be at most {MAX_SOURCES}. Got {len(self.sources)}.")
+        if self.manager.confirmation_sources > max(len(self.sources), 1):
+            raise ParameterError(
+                f"The 'confirmation_sources' parameter must be at most {len(self.sources)}, the number of sources. "
+                f"Got {self.manager.confirmation_sources}."
+            )
         needed = sorted(set(self.rule.needed(self.rule_params)) - _AT_HAND)
         if needed:
             raise ParameterError(
@@ -267,6 +351,11 @@ class CentreConfig:
         every = np.ones(self.layout.size, bool)
         rows = [every if s.transform is None else s.transform.brings for s in self.sources]
         return np.array(rows, bool).reshape(-1, self.layout.size)
+
+    @cached_property
+    def can_initiate(self) -> NDArray[np.bool_]:
+        """Which sources start central tracks, (S,)."""
+        return np.array([source.settings.can_initiate for source in self.sources], bool)
 
     @cached_property
     def draws(self) -> bool:

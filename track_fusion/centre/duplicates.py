@@ -40,10 +40,10 @@ def merge(config: CentreConfig, central: CentralTracks) -> tuple[CentralTracks, 
         return (dataclasses.replace(central, twins=Twins.none()) if len(central.twins) else central), none
     twins = central.twins.after(first, second, len(central))
     ready = twins.steps >= STEPS
-    twins = dataclasses.replace(central, twins=twins)
+    central = dataclasses.replace(central, twins=twins)
     if not ready.any():
-        return twins, none
-    return _united(twins, *_ends(central.tracks.is_confirmed, first[ready], second[ready]))
+        return central, none
+    return _united(central, *_ends(central.tracks.is_confirmed, first[ready], second[ready]))
 
 
 def _close(config: CentreConfig, central: CentralTracks) -> tuple[Indices, Indices]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from track_fusion.angles import wrap
 from track_fusion.centre.config import CentreConfig
+from track_fusion.centre.declared import as_declared, bare
 from track_fusion.centre.links import key_of
 from track_fusion.centre.state import Bools, CentralTracks
 from track_fusion.filters.base import Gaussian
@@ -44,7 +45,8 @@ def admitted(
         scan = scan if keep.all() else scan[keep]
         transform = config.sources[source].transform
         brought = scan if transform is None else transform(scan, config.layout, config.frame_id)
-        held[source] = brought.replace(uuid=None, mean=wrap(brought.mean, config.layout.periods)).owned()
+        own = brought.replace(uuid=None, mean=wrap(brought.mean, config.layout.periods))
+        held[source] = as_declared(config, source, own).owned()
     return tuple(held)
 
 
@@ -105,7 +107,7 @@ class Pool:
             k: scan for k, scan in enumerate(newest)
             if scan is not None and (fresh[k] or not config.params.memory) and _is_young(config, scan, time_ns)
         }  # fmt: skip
-        before = [*scans.values(), central.tracks]
+        before = [*scans.values(), central.tracks.replace(uuid=None)]  # an identity takes no part in a fusion
         after = [predicted_to(batch, time_ns, config.motion) for batch in before]
         tracks = TrackBatch.concatenate(after)
         mean, cov = tracks.moments
@@ -114,10 +116,10 @@ class Pool:
             sound = conditioned(cov, np.concatenate([batch.well_conditioned[:, 0] for batch in after]))
             tracks = tracks.replace(cov=sound[:, None])
         else:
-            particles, bare = np.concatenate([_bare(batch) for batch in before]), _bare(tracks)
-            cov = np.where(bare[:, None, None], cov + config.floor, cov)
+            particles, point = np.concatenate([bare(batch) for batch in before]), bare(tracks)
+            cov = np.where(point[:, None, None], cov + config.floor, cov)
             sound = conditioned(cov, is_well_conditioned(cov))
-            tracks = tracks.replace(cov=conditioned(tracks.cov, tracks.well_conditioned | bare[:, None]))
+            tracks = tracks.replace(cov=conditioned(tracks.cov, tracks.well_conditioned | point[:, None]))
         source = np.repeat(np.fromiter(scans, np.intp), [len(scan) for scan in scans.values()])
         stamp_ns = np.concatenate([batch.time_ns for batch in before])[: len(source)]
         bit = np.zeros(len(tracks), np.uint32)
@@ -140,8 +142,8 @@ class Pool:
         dof = self.tracks.dof[at]
         mixture = None
         if self.tracks.components > 1:
-            bare = _bare(self.tracks)[at]
-            merge = bare & ~bare.all(1, keepdims=True) if take_particles else self.particles[at]
+            point = bare(self.tracks)[at]
+            merge = point & ~point.all(1, keepdims=True) if take_particles else self.particles[at]
             mixture = self._mixtures(at, merge)
         dof_or_none = None if np.isinf(dof).all() else dof
         return SourceTracks(self.mean[at], self.cov[at], dof_or_none, mixture, extras, self.tracks.layout.periods)
@@ -158,11 +160,6 @@ class Pool:
 
 def _is_young(config: CentreConfig, scan: TrackBatch, time_ns: int) -> bool:
     return len(scan) == 0 or time_ns - int(scan.time_ns.min()) <= config.params.max_scan_age_s * SECOND_NS
-
-
-def _bare(tracks: TrackBatch) -> Bools:
-    """Tell which tracks are particles, components without covariance, (N,)."""
-    return np.asarray(~tracks.cov.any((1, 2, 3)))
 
 
 def conditioned(cov: Array, fit: Bools) -> Array:
@@ -187,8 +184,9 @@ def predicted_to(batch: TrackBatch, time_ns: int, motion: Motion) -> TrackBatch:
     if (batch.time_ns == time_ns).all():
         return batch
     mean, cov = np.empty_like(batch.mean), np.empty_like(batch.cov)
-    for stamp in np.unique(batch.time_ns):
-        at = batch.time_ns == stamp
+    alike = bool((batch.time_ns == batch.time_ns[0]).all())
+    for stamp in batch.time_ns[:1] if alike else np.unique(batch.time_ns):
+        at = ... if alike else batch.time_ns == stamp
         transition = motion.over((time_ns - int(stamp)) / SECOND_NS)
         mean[at], cov[at] = Extended().predict(Gaussian(batch.mean[at], batch.cov[at]), transition).moments
     return batch.replace(mean=wrap(mean, batch.layout.periods), cov=cov, time_ns=np.full(len(batch), time_ns))

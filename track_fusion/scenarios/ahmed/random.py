@@ -12,18 +12,10 @@ import numpy as np
 from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.params import from_dict
 from track_fusion.random_streams import stream
-from track_fusion.rules import RULES, FusedTracks
+from track_fusion.rules import FusedTracks
 from track_fusion.scenarios.ahmed import PAPER
-from track_fusion.scenarios.ahmed.mixtures import (
-    INGIS_VARIANCE,
-    Problem,
-    contour_chart,
-    log_fused,
-    scores,
-    shown,
-)
+from track_fusion.scenarios.ahmed.mixtures import INGIS_VARIANCE, Problem, contour_chart, log_fused, scores, shown
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.claim import Claim, ascending
 from track_fusion.study.rows import Outcomes, Progress, chosen, run_by_run
@@ -69,7 +61,7 @@ def _choice(key: str, variant: str, **values: Any) -> RuleChoice:
         # As the paper has it, omega is sought on one set of samples, whatever its error.
         common |= {"criterion": "minimax_information_loss", "samples": OMEGA_SAMPLES, "omega_proposal": "first_order"}
         common["omega_error"] = 1.0
-    return RuleChoice(key, from_dict(RULES[key].params, common | values), variant)
+    return RuleChoice.of(key, variant, **common | values)
 
 
 def _dls(key: str, variant: str, count: int) -> RuleChoice:
@@ -231,29 +223,21 @@ def _claims() -> Iterator[Claim]:
         yield Claim.order(f"{kind} fusion by IGS improves with the samples", figure, *_names(key, *reversed(igs)))
         yield Claim.each(
             f"{kind} fusion: DLS is more accurate than IGS in nearly all cases (judged: in the median at each of the "
-            "four numbers of samples)",
-            figure,
-            _names(key, *dls),
-            _names(key, *igs),
-            ascending,
-        )
+            "four numbers of samples)", figure, _names(key, *dls), _names(key, *igs), ascending,
+        )  # fmt: skip
         yield Claim(
             f"{kind} fusion: DLS and IGS improve on {rough.upper()} (judged: with each of their numbers of samples)",
-            f"Section 6, {figure}",
-            _names(key, *dls, *igs, rough),
+            f"Section 6, {figure}", _names(key, *dls, *igs, rough),
             lambda *all_: [all_[-1] - divergence for divergence in all_[:-1]],
-        )
+        )  # fmt: skip
     for key in ("mixture_exact", "mixture_wep"):
         printed = {name: value for name, value in FIGURES_4_5.items() if name.startswith(f"given-{key}@")}
         order = [name.partition("@")[2] for name in sorted(printed, key=lambda name: printed[name])]
         listed = ", ".join(name.removeprefix("example_") for name in order)
         source = "Fig. 4" if key == "mixture_exact" else "Fig. 5"
         yield Claim.order(f"in the example, from the best: {listed}", source, *_names(key, *order))
-    yield Claim.order(
-        "IGS with 1000 samples is more accurate than expectation maximisation of 5000",
-        "Section 5.1, Fig. 5",
-        *_names("mixture_wep", "example_igs_1000", "example_em_5000"),
-    )
+    yield Claim.order("IGS with 1000 samples is more accurate than expectation maximisation of 5000",
+                      "Section 5.1, Fig. 5", *_names("mixture_wep", "example_igs_1000", "example_em_5000"))  # fmt: skip
     for key, methods in QUICKEST_FIRST.items():
         yield Claim.order(
             f"time of {'exact' if key == 'mixture_exact' else 'WEP'} fusion, from the least: {', '.join(methods)}",

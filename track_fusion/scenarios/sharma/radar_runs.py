@@ -10,19 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.centre.centre import FusionCentre
-from track_fusion.centre.config import CentreConfig, FusionCentreParams, SourceConfig, TrackManagerParams
+from track_fusion.centre.config import (
+    CentreConfig,
+    FusionCentreParams,
+    IdentityParams,
+    SourceConfig,
+    TrackManagerParams,
+)
 from track_fusion.linalg import Array
 from track_fusion.metrics.pairing import paired
 from track_fusion.models.geodetic import LocalFrame
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.rules import RULES
-from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
-from track_fusion.rules.harmonic_mean import HarmonicMeanParams
-from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
-from track_fusion.rules.naive import NaiveParams
 from track_fusion.scenarios.sharma.surveillance import Courses, Radar, Surveillance
-from track_fusion.study.rows import Outcomes, Progress
+from track_fusion.study.rows import Outcomes, Progress, run_by_run
 from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.trackers.many_targets import PdaTracker, PdaTrackerParams
 from track_fusion.tracks import SECOND_NS, TrackBatch, planar_layout
@@ -78,11 +80,12 @@ TRACKER = PdaTrackerParams(
     deletion_existence=0.001,
 )
 MANAGER = TrackManagerParams(confirmation_threshold=(2, 3), deletion_threshold=(2, 2), max_coast_s=25.0)
+IDENTITY = IdentityParams("sharma-radars")
 RULE_CHOICES = (
-    RuleChoice("covariance_intersection", CovarianceIntersectionParams()),
-    RuleChoice("inverse_covariance_intersection", InverseCovarianceIntersectionParams()),
-    RuleChoice("harmonic_mean", HarmonicMeanParams(combine="fold")),
-    RuleChoice("naive", NaiveParams()),
+    RuleChoice.of("covariance_intersection"),
+    RuleChoice.of("inverse_covariance_intersection"),
+    RuleChoice.of("harmonic_mean", combine="fold"),
+    RuleChoice.of("naive"),
 )
 FUSION_TIMES_S: Array = SCAN_S * np.arange(FUSION_SCANS, STEPS + 1, FUSION_SCANS, dtype=np.float64)
 
@@ -146,7 +149,8 @@ def centre(choice: RuleChoice) -> FusionCentre:
     """Return the fusion centre, with memory, that fuses by this rule."""
     sources = tuple(map(SourceConfig, RADARS))
     rule, params = RULES[choice.key], FusionCentreParams(memory=True)
-    return FusionCentre(CentreConfig(sources, MOTION, FRAME, rule, choice.params, params, MANAGER))
+    config = CentreConfig(sources, MOTION, FRAME, rule, choice.params, params, MANAGER, identity=IDENTITY)
+    return FusionCentre(config)
 
 
 #: What is kept of each target at a fusion, NaN where it is lost, and of the fusion.
@@ -192,11 +196,7 @@ def judged_alone(scans: Mapping[int, TrackBatch], truth: Array) -> Judged:
 
 def tracked(rows: Mapping[str, RuleChoice | None], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Run rules, and the radars alone (None), on the same tracks of the radars; see :func:`simulate`."""
-    each = [
-        _one_run(rows, seed, run, lambda share, done=done: progress((done + share) / len(runs)))  # type: ignore[misc]
-        for done, run in enumerate(runs)
-    ]
-    return {name: np.stack([one[name] for one in each]) for name in each[0]}
+    return run_by_run(runs, progress, lambda run, tell: _one_run(rows, seed, run, tell))
 
 
 def _one_run(rows: Mapping[str, RuleChoice | None], seed: int, run: int, progress: Progress) -> dict[str, Array]:
