@@ -50,12 +50,16 @@ def _close(config: CentreConfig, central: CentralTracks) -> tuple[Indices, Indic
     """Pairs of living tracks inside each other's gate that no source supports both, the older first."""
     sources = np.int64(1) << np.arange(len(config.sources))
     support = ((central.history & LATELY) > 0) @ sources
-    own = support if config.params.merge_duplicates == "across_sources" else np.zeros_like(support)
+    nobody = np.zeros(0, np.intp)
+    across = config.params.merge_duplicates == "across_sources"
+    if len(central) < 2 or (across and np.bitwise_and.reduce(support)):  # a source that supports all tells all apart
+        return nobody, nobody
+    own = support if across else np.zeros_like(support)
     kinds, kind = np.unique(own, return_inverse=True)
     apart = ((kinds[:, None] & kinds) == 0).any(1)[kind.ravel()]
     rows = np.flatnonzero(apart & (support > 0))
     if len(rows) < 2:
-        return rows[:0], rows[:0]
+        return nobody, nobody
     mean, cov = central.tracks[rows].moments
     cov = conditioned(cov, is_well_conditioned(cov))
     own = own[rows]

@@ -68,7 +68,10 @@ class Links:
         """
         at = np.flatnonzero(row >= 0)
         new = Links(key[at], row[at], idle[at])
-        absent = self[~np.isin(self.key, key)] if len(self) else self
+        new = new[np.argsort(new.key)]
+        if not len(self) or np.array_equal(self.key, new.key):
+            return new
+        absent = self[~np.isin(self.key, key)]
         if len(absent):
             source = absent.key >> ID_BITS
             rest = Links(absent.key, absent.row, absent.idle + fresh[source])
