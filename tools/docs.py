@@ -229,9 +229,9 @@ def fusion_centre_sections() -> list[Section]:
     return [
         *map(Section, (FrameParams, SourceParams)),
         *(
-            Section(kind, f"{name}.", title and f"{title} {name}.")
+            Section(kind, f"{name}.", f"{what} {name}.")
             for name in SourceParams().source_configurations
-            for kind, title in ((OneSourceParams, "The source"), (SourceSettings, "What is declared of"))
+            for kind, what in ((OneSourceParams, "The source"), (SourceSettings, "What is declared of"))
         ),
         Section(MotionChoice),
         *_alternatives("motion", MOTIONS.own, MotionChoice().motion),

@@ -41,6 +41,7 @@ def params_file(folder: Path, oracle: str, **given: Any) -> Path:
     own |= {f"{s}.topic": f"/{s}/{topic}" for s in SENSORS}
     own |= {"source_types": ["odometry" if oracle == "odometry" else "track_table"] * 2}
     own |= {"fusion_timeout_s": 1000.0, "source_timeout_s": 10_000.0, "max_delay_s": 1000.0, "max_future_s": 10.0}
+    own |= {"identity_namespace": "fusion_centre"}
     path = folder / "centre.yaml"
     path.write_text(json.dumps({"fusion_centre": {"ros__parameters": own | given}}))
     return path

@@ -20,7 +20,7 @@ SECOND, MS = 10**9, 10**6
 
 
 def made(told: list[str] | None = None, **values: Any) -> MessageCentre:
-    given = GivenParameters(values, "fusion_centre")
+    given = GivenParameters({"identity_namespace": "test"} | values, "fusion_centre")
     return MessageCentre(given, given.values, Counts((told if told is not None else []).append), given(ClockParams))
 
 

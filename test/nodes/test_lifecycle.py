@@ -239,6 +239,7 @@ def test_a_clock_that_jumps_back_starts_the_centre_anew(nodes: Set) -> None:
     nodes.diagnostics.wait_for("jumping_centre", lambda v: v.get("clock_jumps") == "1", "the jump to be counted")
     source.publish(track_table(50 * SECOND_NS, far_apart[1:]))
     nodes.await_count(fused, 3, "a step after the jump", ticker, 50 * SECOND_NS)
+    # What was is forgotten, but for the identifiers: none is given again.
     assert (stamp_ns(fused[-1]), read(fused[-1]).track_id.tolist()) == (50 * SECOND_NS, [3])
     assert read(fused[-1]).mean[0, 0].tolist() == far_apart[1]
     assert nodes.diagnostics.rejected("jumping_centre") == {}

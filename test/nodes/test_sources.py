@@ -20,7 +20,7 @@ OFFSET_S = -18.0  # how far behind the clock of the source is: it is ahead
 PARAMS: dict[str, Any] = PATIENT | {
     "source_configurations": ["left", "right"],
     "trigger": "any_source",
-    "max_future_s": 0.5,
+    "max_future_s": 2.0,
     "confirmation_threshold": [1, 1],
     "left.max_tracks_per_scan": 2,
     "right.can_initiate": False,
@@ -74,7 +74,7 @@ def test_sources_are_taken_as_declared_and_identities_go_out(ros_context: Any) -
             diagnostics.wait_for_counts(name, counts)
         published("left", second_ns, [0.0, 0.0, 0.0, 0.0], [50.0, 0.0, 0.0, 0.0])
         answered(2, second_ns)
-        third_ns = second_ns + SECOND_NS // 10
+        third_ns = second_ns + SECOND_NS  # the scan of left is too old by then
         published("right", third_ns, [0.0, 0.0, 0.0, 0.0])
         answered(3, third_ns)
 

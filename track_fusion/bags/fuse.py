@@ -52,12 +52,15 @@ class Outcome:
 def centre_of(params: Path, tell: Callable[[str], object]) -> MessageCentre:
     """Make the centre that the node fusion_centre would be with a parameter file.
 
+    Identities are those of the namespace "fusion_centre" unless the file names another one.
+
     Raises
     ------
     Fault             the file cannot be read
     ParameterError    a parameter is wrong or unknown, or the file has nothing for the node
     """
-    given = GivenParameters(parameters_of(params, f"/{NODE}"), NODE)
+    # The same bag gives the same identities, in whatever run.
+    given = GivenParameters({"identity_namespace": NODE} | parameters_of(params, f"/{NODE}"), NODE)
     given(ManagedParams)
     centre = MessageCentre(given, given.values, Counts(tell), given(ClockParams))
     given.refuse_unknown()

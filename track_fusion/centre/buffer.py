@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from track_fusion.centre import rhythm
 from track_fusion.centre.config import CentreConfig, ScanBufferParams
-from track_fusion.centre.rhythm import STAMPS_KEPT, period_ns
 from track_fusion.tracks import SECOND_NS, TrackBatch
 
 #: A source is due this share of a period after its last scan: stamps jitter.
@@ -100,6 +100,11 @@ class Step(NamedTuple):
     late: tuple[tuple[int, TrackBatch, int], ...] = ()
 
 
+def period_ns(queue: Queue) -> int:
+    """Tell the period of a source, 0 = unknown yet."""
+    return rhythm.period_ns(queue.stamps)
+
+
 def add(
     config: CentreConfig, buffer: ScanBuffer, source: int, scan: TrackBatch, stamp_ns: int, now_ns: int
 ) -> tuple[ScanBuffer, str | None]:
@@ -162,7 +167,7 @@ def _taken_in(assembles: bool, queue: Queue, new: Waiting) -> tuple[Queue, str |
     if same is not None:
         return _joined(queue, same, new)
     waiting = sorted((*queue.waiting, new._replace(scan=new.scan.owned())), key=lambda w: w.stamp_ns)
-    stamps = tuple(sorted((*queue.stamps, new.stamp_ns))[-STAMPS_KEPT:])
+    stamps = tuple(sorted((*queue.stamps, new.stamp_ns))[-rhythm.STAMPS_KEPT :])
     queue = dataclasses.replace(queue, waiting=tuple(waiting), stamps=stamps)
     return dataclasses.replace(queue, ids=ids, expected=queue.ids) if new.stamp_ns > newest else queue, None
 
@@ -281,7 +286,7 @@ def _is_complete(config: CentreConfig, buffer: ScanBuffer, time_ns: int, now_ns:
 
 
 def _is_due(queue: Queue, newest_ns: int, time_ns: int) -> bool:
-    period = period_ns(queue.stamps)
+    period = period_ns(queue)
     return period > 0 and time_ns - newest_ns >= DUE_SHARE * period
 
 

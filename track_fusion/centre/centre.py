@@ -47,7 +47,7 @@ class FusionCentre:
         self.state, self.buffer = CentreState.initial(config), ScanBuffer.empty(config)
 
     def reset(self) -> None:
-        """Forget all tracks and scans; identities go on, so that none is given again."""
+        """Forget all tracks and scans; identifiers go on counting."""
         given = self.state.central.identities
         self.state, self.buffer = CentreState.initial(self.config, given), ScanBuffer.empty(self.config)
 

@@ -249,15 +249,15 @@ class CentreConfig:
     manager : TrackManagerParams
     buffer : ScanBufferParams
     random : RandomParams              what rules that sample draw from, step after step
-    identity : IdentityParams
     clock : ClockParams                how far the clocks may be trusted
+    identity : IdentityParams
 
     Raises
     ------
     ParameterError    too many sources; the rule needs what source tracks do not bring, such as their
                       cross-covariance; `confirmation_sources` exceeds them; weights are given that do not fit the
-                      sources; not one number an axis in
-                      `particle_variances`; a transform does not bring every axis of the centre
+                      sources; not one number an axis in `particle_variances`; a transform does not bring every axis of
+                      the centre
     """
 
     sources: tuple[SourceConfig, ...]
@@ -269,8 +269,8 @@ class CentreConfig:
     manager: TrackManagerParams = TrackManagerParams()
     buffer: ScanBufferParams = ScanBufferParams()
     random: RandomParams = RandomParams(role="fusion_centre")
-    identity: IdentityParams = IdentityParams()
     clock: ClockParams = ClockParams()
+    identity: IdentityParams = IdentityParams()
 
     def __post_init__(self) -> None:
         if len(self.sources) > MAX_SOURCES:

@@ -141,7 +141,7 @@ class MessageCentre:
             CentreConfig(
                 sources, motion, self.frame.frame_id, rule, declare(rule.params, f"{rule.key}."),
                 declare(FusionCentreParams), declare(TrackManagerParams), declare(ScanBufferParams),
-                declare(RandomParams), declare(IdentityParams), clock,
+                declare(RandomParams), clock=clock, identity=declare(IdentityParams),
             )
         )  # fmt: skip
         self._told_ns = 0
@@ -155,9 +155,9 @@ class MessageCentre:
         """
         yield from self.advance(now_ns)
         layout, kind = self.centre.config.layout, self.sources[source].kind
-        offset_ns = self.centre.config.sources[source].settings.time_offset_ns
-        stamp_ns = check_header(  # by the source's clock
-            msg.header, frame_id=self.frame.frame_id, now_ns=now_ns - offset_ns, max_future_ns=self.frame.max_future_ns
+        own_now_ns = now_ns - self.centre.config.sources[source].settings.time_offset_ns  # by the source's clock
+        stamp_ns = check_header(
+            msg.header, frame_id=self.frame.frame_id, now_ns=own_now_ns, max_future_ns=self.frame.max_future_ns
         )
         arrays, supplied = kind.read(msg, layout.axes, self._cross_block)
         if kind.lacks:
