@@ -75,10 +75,19 @@ def random_scans(rng, sources):
     return scans
 
 
+#: One gate alone; links and duplicates as by default, with little patience; for sources that split targets.
+IDENTITY = {
+    "one gate": {"keep_probability": 1e-6, "patience": 0, "merge_duplicates": "off"},
+    "links": {"keep_probability": 0.9999, "patience": 2, "merge_duplicates": "across_sources"},
+    "shared": {"keep_probability": 0.9999, "patience": 1, "merge_duplicates": "also_within_a_source"},
+}
+
+
+@pytest.mark.parametrize("identity", IDENTITY)
 @pytest.mark.parametrize("memory", [False, True], ids=["memoryless", "memory"])
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_random_scenes_equal_the_oracle(seed, count, memory):
+def test_random_scenes_equal_the_oracle(seed, count, memory, identity):
     rng = np.random.default_rng(1000 * count + seed)
     names = [f"sensor_{k}" for k in range(count)]
     pairs = count + memory == 2  # what the oracle's covariance intersection can do
@@ -87,11 +96,12 @@ def test_random_scenes_equal_the_oracle(seed, count, memory):
     settings = Settings(
         names, max_scan_age_s=0.15, gate_probability=(0.99, 0.7)[seed % 2], confirmation_threshold=(2, 3),
         deletion_threshold=(3, 4), max_coast_s=0.7, process_noise=2.0, memory=memory,
+        **IDENTITY[identity],
     )  # fmt: skip
     wanted, _, margins = run_centre(scans, rule, settings)
     assert min(margins["gate"] + margins["assignment"], default=1.0) > 1e-9, "a decision hangs on rounding"
 
-    given = {k: getattr(settings, k) for k in ("gate_probability", "max_scan_age_s", "memory")}
+    given = {k: getattr(settings, k) for k in ("gate_probability", "max_scan_age_s", "memory", *IDENTITY[identity])}
     manager = TrackManagerParams(
         **{k: v for k, v in vars(settings).items() if k in TrackManagerParams.__dataclass_fields__}
     )

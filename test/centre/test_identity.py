@@ -1,103 +1,100 @@
-"""Identities: reproducible where a namespace is given, else never given again, and as lasting as the track."""
-
-import uuid
+"""Identities with default parameters: no ghosts, no change, in scenes of trackers whose errors persist."""
 
 import numpy as np
 import pytest
 
-from track_fusion.centre import identity as identity_module
-from track_fusion.centre.centre import FusionCentre
-from track_fusion.centre.config import CentreConfig, IdentityParams, SourceConfig, TrackManagerParams
-from track_fusion.centre.identity import Identities
-from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
-from track_fusion.rules import RULES
+from benchmark import identity, scenes
+from benchmark.identity import Score, centre_of, score, side_by_side, single_gate, table
 from track_fusion.tracks import TrackBatch, planar_layout
 
-LAYOUT, SECOND = planar_layout(), 10**9
-START_NS = 1_764_302_403_123_456_789
+SECOND = 10**9
+BOTH_TRIGGERS = pytest.mark.parametrize("staggered", [False, True], ids=["all_sources", "any_source"])
 
 
-def centre(namespace=""):
-    rule, manager = RULES["naive"], TrackManagerParams(confirmation_threshold=(1, 1), deletion_threshold=(1, 1))
-    motion, sources = NearlyConstantVelocity(LAYOUT, MotionParams()), (SourceConfig("a"), SourceConfig("b"))
-    identity = IdentityParams(namespace)
-    return FusionCentre(CentreConfig(sources, motion, "map", rule, rule.params(), manager=manager, identity=identity))
+def keeps(result: Score, targets: int) -> bool:
+    return result.ids == targets and result.ghosts <= 0.01
 
 
-def scan(time_ns, *places):
-    mean = np.array([[x, 0.0, 0.0, 0.0] for x in places]).reshape(-1, 4)
-    return TrackBatch.gaussian(LAYOUT, "map", mean, np.tile(np.eye(4), (len(mean), 1, 1)), time_ns=time_ns)
+@BOTH_TRIGGERS
+@pytest.mark.parametrize("sd", [1.0, 2.0, 4.0, 8.0])
+def test_consistent_trackers_make_no_ghosts(sd, staggered):
+    made = side_by_side(np.random.default_rng(3), staggered, (1.0, sd), seconds=12.0)
+    assert keeps(score(made), 20)
 
 
-def names(tracks):
-    """UUIDs by number."""
-    return {int(i): uuid.UUID(bytes=u.tobytes()) for i, u in zip(tracks.track_id, tracks.uuid, strict=True)}
+@BOTH_TRIGGERS
+@pytest.mark.parametrize("share", [4, 16])
+def test_a_covariance_told_too_small_makes_no_ghosts(share, staggered):
+    made = side_by_side(np.random.default_rng(4), staggered, seconds=12.0, claim=1.0 / share)
+    assert keeps(score(made), 20)
+    assert not keeps(score(made, **single_gate(0.99)), 20)
 
 
-def test_a_uuid_lasts_as_long_as_its_track():
-    own, seen = centre(), []
-    for k, places in enumerate([(0, 100), (0, 100), (0, 200), (0, 200)], 1):
-        fused, _ = own.step(k * SECOND // 10, {0: scan(k * SECOND // 10, *places)})
-        seen.append(names(fused))
-    assert seen[0] == seen[1]
-    assert seen[2] == seen[3]
-    assert len(seen[0].keys() & seen[2].keys()) == 1
-    assert all(seen[0][i] == seen[2][i] for i in seen[0].keys() & seen[2].keys())
-    given = {**seen[0], **seen[2]}
-    assert len(set(given.values())) == len(given) == 3
-    assert {u.version for u in given.values()} == {5}
+@BOTH_TRIGGERS
+@pytest.mark.parametrize("change", ["restart", "shuffled"])
+def test_new_and_shuffled_ids_of_a_source_change_no_central_id(change, staggered):
+    rng = np.random.default_rng(5)
+    how = {"restart": 30} if change == "restart" else {"second": lambda told: scenes.shuffled(rng, told)}
+    result = score(side_by_side(rng, staggered, seconds=12.0, **how))
+    assert (result.ids, result.ghosts, result.switches) == (20, 0.0, 0)
 
 
-def test_a_namespace_makes_them_the_same_in_every_run_and_another_one_others():
-    first, again, other = (centre(n).step(0, {0: scan(0, 0, 100)})[0] for n in ("run", "run", "others"))
-    assert first.track_id.tolist() == again.track_id.tolist() == other.track_id.tolist() == [1, 2]
-    assert names(first) == names(again)
-    assert not set(names(first).values()) & set(names(other).values())
-    # By the standard library, of names that anybody can write down.
-    base = uuid.uuid5(uuid.uuid5(uuid.NAMESPACE_DNS, "track_fusion.identity_namespace"), "run")
-    assert names(first) == {1: uuid.uuid5(base, "1"), 2: uuid.uuid5(base, "2")}
+@BOTH_TRIGGERS
+@pytest.mark.parametrize("swap", [False, True])
+@pytest.mark.parametrize("sds", [(1.0, 1.0), (0.3, 1.0)])
+def test_crossing_targets_keep_their_ids(sds, swap, staggered):
+    for seed in range(3):
+        made = identity.crossed(np.random.default_rng(seed), staggered, 4.0, sds, swap)
+        assert identity.is_right(score(made), 2)
 
 
-def test_restarts_give_no_identity_again(monkeypatch):
-    """FIELD pain 34: one second apart, with hundreds of births in between, over a day of restarts."""
-    numbers, uuids = [], []
-    for start_s in (0, 1, 2, 3600, 86_400):
-        monkeypatch.setattr(identity_module.time, "time_ns", lambda at=start_s: START_NS + at * SECOND)
-        ids, names_, _ = Identities.begun(IdentityParams()).given(900)
-        numbers += ids.tolist()
-        uuids += [u.tobytes() for u in names_]
-    assert len(set(numbers)) == len(numbers)
-    assert len(set(uuids)) == len(uuids)
-    assert max(numbers) < 2**31
+@pytest.mark.slow
+@pytest.mark.parametrize("name", table())
+def test_a_row_of_the_table_is_as_wanted(name):
+    row = table()[name]
+    results = [score(row.make(np.random.default_rng(draw), False), **row.params) for draw in range(row.draws)]
+    targets = int(results[0].living[0])
+    if row.draws > 1:
+        assert np.mean([identity.is_right(result, targets) for result in results]) >= 0.99
+    else:
+        assert results[0].ghosts <= 0.01
 
 
-def test_two_that_start_in_the_same_millisecond_have_other_uuids(monkeypatch):
-    monkeypatch.setattr(identity_module.time, "time_ns", lambda: START_NS)
-    left, right = centre(), centre()
-    at = names(left.step(0, {0: scan(0, 0)})[0]), names(right.step(0, {0: scan(0, 0)})[0])
-    assert at[0].keys() == at[1].keys() == {START_NS // 10**6 % 2**31}
-    assert set(at[0].values()).isdisjoint(at[1].values())
+def one(x: float, variance: tuple[float, ...], time_ns: int, track_id: int = 0) -> TrackBatch:
+    mean = np.array([[x, 0.0, 0.0, 0.0]])
+    return TrackBatch.gaussian(
+        planar_layout(), "map", mean, np.diag(variance)[None], time_ns=time_ns, track_id=np.array([track_id])
+    )
 
 
-@pytest.mark.parametrize("namespace", ["", "run"])
-def test_a_reset_forgets_tracks_and_gives_no_identity_again(namespace):
-    own = centre(namespace)
-    before = names(own.step(SECOND, {0: scan(SECOND, 0, 100)})[0])
-    own.reset()
-    after = names(own.step(0, {0: scan(0, 0, 100)})[0])
-    assert min(after) == max(before) + 1
-    assert set(before.values()).isdisjoint(after.values())
+def test_a_source_that_strays_for_a_while_makes_no_second_track():
+    """FIELD pain 16."""
+    centre, published = centre_of(), []
+    for k in range(60):
+        x, time_ns = (0.0 if k < 10 else 8.0 if k < 13 else 5.0), (k + 1) * SECOND // 10
+        scans = {0: one(0.0, (0.1,) * 4, time_ns), 1: one(x, (4.0, 4.0, 1.0, 1.0), time_ns)}
+        published.append(len(centre.step(time_ns, scans)[0]))
+    assert max(published) == 1
 
 
-def test_numbers_begin_again_at_0_after_the_last_that_the_wire_holds_and_uuids_do_not():
-    late = Identities(uuid.UUID(int=7), 2**32 - 1)
-    ids, uuids, after = late.given(3)
-    assert ids.tolist() == [2**32 - 1, 0, 1]
-    assert after.births == 2**32 + 2
-    early = Identities(uuid.UUID(int=7), 0).given(2)[1]
-    assert {u.tobytes() for u in uuids[1:]}.isdisjoint(u.tobytes() for u in early)
+def test_a_source_that_splits_a_target_gives_one_track():
+    """FIELD pain 18: two at first, one as soon as they have stayed together for three steps."""
+    centre = centre_of(merge_duplicates="also_within_a_source")
+    variance = (1.0, 1.0, 0.1, 0.1)
+    for k in range(30):
+        time_ns = (k + 1) * SECOND // 10
+        twice = TrackBatch.concatenate([one(0.0, variance, time_ns, 1), one(0.3, variance, time_ns, 2)])
+        fused, info = centre.step(time_ns, {0: twice, 1: one(0.1, variance, time_ns)})
+        assert len(info.merged) == (k == 2)
+    assert len(fused) == 1
+    assert len(centre.tracks) == 1
 
 
-def test_nobody_newborn_costs_nothing_and_gives_nothing():
-    ids, uuids, after = (begun := Identities(uuid.UUID(int=7), 5)).given(0)
-    assert (ids.shape, uuids.shape, after) == ((0,), (0, 16), begun)
+def test_patience_counts_updates_and_then_a_track_may_start():
+    centre = centre_of(patience=3)
+    for k in range(1, 10):
+        time_ns = k * SECOND // 10
+        scans = {0: one(0.0, (0.1,) * 4, time_ns), 1: one(0.0 if k < 4 else 100.0, (0.1,) * 4, time_ns)}
+        _, info = centre.step(time_ns, scans)
+        assert (info.held, info.released) == (int(4 <= k < 7), int(k == 7))
+        assert len(centre.tracks) == 1 + (k >= 7)

@@ -243,7 +243,9 @@ def test_several_sources_must_confirm():
 
 
 def test_the_oldest_tentative_tracks_are_dropped_and_confirmed_ones_are_not():
-    own = FusionCentre(config(PLAIN, manager=TrackManagerParams(max_tentative_tracks=3, deletion_threshold=(9, 9))))
+    manager = TrackManagerParams(max_tentative_tracks=3, deletion_threshold=(9, 9))
+    # The identifiers of a scan are its rows, so that one names another target at each: no patience with them.
+    own = FusionCentre(config(PLAIN, manager=manager, patience=0))
     places = [[100.0 * k, 0, 0, 0] for k in range(9)]
     own.step(0, {0: scan(0, *places[:2])})
     own.step(SECOND, {0: scan(SECOND, *places[:2])})

@@ -48,16 +48,32 @@ class FusionCentreParams(Params):
 
     association: str = param(
         "nearest",
-        "nearest: global nearest neighbour within the gate; single_target: all sources are known to track one and the "
+        "nearest: global nearest neighbour within the gates; single_target: all sources are known to track one and the "
         "same target, so that the first track of each is taken without a gate",
         choices=("nearest", "single_target"),
     )
     gate_probability: float = param(
-        0.99,
+        0.9999,
         "share of true pairs of tracks inside the gate (chi-square over all axes)",
         low=0.0,
         high=1.0 - 1e-12,
         strict=True,
+    )
+    keep_probability: float = param(
+        1.0 - 1e-6,
+        "the same for a source track and the central track that it fed last, if wider",
+        low=0.0,
+        high=1.0 - 1e-12,
+        strict=True,
+    )
+    patience: int = param(
+        5, "updates in a row that a source track beyond that gate is held out before it starts a track", low=0
+    )
+    merge_duplicates: str = param(
+        "across_sources",
+        "make one of two central tracks that stay together: where no source supports both, even where one does "
+        "(a source that splits targets), or never",
+        choices=("across_sources", "also_within_a_source", "off"),
     )
     max_scan_age_s: float = param(
         0.5, "a source's newest scan takes part, predicted, until it is older than this", unit="s", low=0.0
@@ -313,6 +329,11 @@ class CentreConfig:
     def gamma(self) -> float:
         """The gate: a quantile of chi-square with n degrees of freedom."""
         return chi_square_quantile(self.params.gate_probability, self.layout.size)
+
+    @cached_property
+    def keep_gamma(self) -> float:
+        """The gate of linked tracks, not narrower than the other."""
+        return max(self.gamma, chi_square_quantile(self.params.keep_probability, self.layout.size))
 
     @cached_property
     def floor(self) -> Array:

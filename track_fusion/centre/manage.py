@@ -40,7 +40,7 @@ def manage(
     Parameters
     ----------
     params : TrackManagerParams
-    before : CentralTracks    the old ones
+    before : CentralTracks    the old ones, with the links of this step
     fused : Fused             the old ones in their order, then the newborn (their track_id is given here), T
     member : (T, S)           which source has a member in which track
     fresh : (S,)              which source delivered a new scan
@@ -66,6 +66,7 @@ def manage(
         ),
         fused.has, history, _grown(before.updates, new) + fresh, _grown(before.hit_ever, new) | hit,
         np.where(supported_ns >= 0, supported_ns, _grown(before.supported_ns, new)), identities,
+        before.links, before.twins,
     )  # fmt: skip
     dead = coasted & _expired(params, after, stamps) if coasted.any() else coasted
     dropped = _surplus(params, ~confirmed & ~dead)

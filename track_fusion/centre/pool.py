@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from track_fusion.angles import wrap
 from track_fusion.centre.config import CentreConfig
 from track_fusion.centre.declared import as_declared, bare
+from track_fusion.centre.links import key_of
 from track_fusion.centre.state import Bools, CentralTracks
 from track_fusion.filters.base import Gaussian
 from track_fusion.filters.extended import Extended
@@ -125,6 +126,11 @@ class Pool:
         bit[: len(source)] = np.left_shift(np.uint32(1), source.astype(np.uint32))
         has = np.concatenate([config.brings[source], central.has])
         return cls(tracks, mean, sound, has, source, stamp_ns, bit, particles)
+
+    @property
+    def key(self) -> NDArray[np.int64]:
+        """Which source track each is, by source and its own identifier, (P,)."""
+        return key_of(self.source, self.tracks.track_id[: len(self.source)])
 
     def split(self) -> tuple[Array, Array, Array, Array]:
         """Moments of the source tracks, then of the central ones."""

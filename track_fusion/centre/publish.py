@@ -28,6 +28,9 @@ class StepInfo:
     unconverged : int           fusions whose weights did not converge
     unsound : int               fusions whose result was no density, so that a single member was taken instead
     beyond_half_circle : int    fusions of members that have no mean direction, made about the most certain one
+    held : int                  tracks of new scans held out of the fusion: too far from the central track they feed
+    released : int              tracks held out for too long, which are free to start or join another one
+    merged : (K, 2)             identifiers of central tracks and of those that ended in them, as duplicates
     """
 
     members: NDArray[np.intp]
@@ -36,6 +39,9 @@ class StepInfo:
     unconverged: int
     unsound: int
     beyond_half_circle: int
+    held: int
+    released: int
+    merged: NDArray[np.int64]
 
 
 def publish(params: FusionCentreParams, tracks: TrackBatch) -> TrackBatch:
@@ -43,10 +49,15 @@ def publish(params: FusionCentreParams, tracks: TrackBatch) -> TrackBatch:
     return tracks if params.publish_tentative or tracks.is_confirmed.all() else tracks[tracks.is_confirmed]
 
 
-def told(sources: int, pool: Pool, association: Association, fused: Fused, changes: Changes) -> StepInfo:
+def told(
+    sources: int, pool: Pool, association: Association, fused: Fused, changes: Changes, merged: NDArray[np.int64]
+) -> StepInfo:
     """Sum up a step of a centre of so many sources."""
     member = association.member
     foreign = int(np.count_nonzero(pool.tracks.source[member] & ~pool.bit[member]))
     taken = np.bincount(pool.source[member], minlength=sources)
     shared = foreign + len(association.remembered)
-    return StepInfo(taken, changes, shared, fused.unconverged, fused.unsound, fused.beyond)
+    return StepInfo(
+        taken, changes, shared, fused.unconverged, fused.unsound, fused.beyond, association.held, association.released,
+        merged,
+    )  # fmt: skip

@@ -9,13 +9,46 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from track_fusion.association.gate import Indices
 from track_fusion.centre.config import CentreConfig
 from track_fusion.centre.identity import Identities
+from track_fusion.centre.links import Links
 from track_fusion.centre.rhythm import Stamps
 from track_fusion.random_streams import StreamPosition
 from track_fusion.tracks import ROW_FIELDS, UUID_BYTES, TrackBatch
 
 Bools = NDArray[np.bool_]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Twins:
+    """Pairs of central tracks that may be one target: rows, the smaller first, and for how many steps, (K,) each."""
+
+    first: Indices
+    second: Indices
+    steps: Indices
+
+    @classmethod
+    def none(cls) -> Twins:
+        """No pair."""
+        return cls(*np.zeros((3, 0), np.intp))
+
+    def __len__(self) -> int:
+        """Return the number of pairs K."""
+        return len(self.first)
+
+    def after(self, first: Indices, second: Indices, count: int) -> Twins:
+        """Take the pairs of a step, among so many tracks: those that were there before have been so a step longer."""
+        before = np.zeros(len(first), np.intp)
+        at, old = np.nonzero((first * count + second)[:, None] == self.first * count + self.second)
+        before[at] = self.steps[old]
+        return Twins(first, second, before + 1)
+
+    def renumbered(self, row: Indices) -> Twins:
+        """Follow central tracks to their new rows, (T,), -1 = gone."""
+        first, second = row[self.first], row[self.second]
+        left = (first >= 0) & (second >= 0)
+        return Twins(first[left], second[left], self.steps[left])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -31,6 +64,8 @@ class CentralTracks:
     hit_ever : (T, S)        whether there was a hit
     supported_ns : (T,)      stamp of the scan of the last member
     identities : Identities  those given so far
+    links : Links            which source tracks feed them
+    twins : Twins            which may be one target
     """
 
     tracks: TrackBatch
@@ -40,6 +75,8 @@ class CentralTracks:
     hit_ever: Bools
     supported_ns: NDArray[np.int64]
     identities: Identities
+    links: Links = dataclasses.field(default_factory=Links.none)
+    twins: Twins = dataclasses.field(default_factory=Twins.none)
 
     @classmethod
     def none(cls, config: CentreConfig, identities: Identities) -> CentralTracks:
@@ -58,9 +95,10 @@ class CentralTracks:
 
     def __getitem__(self, rows: Bools) -> CentralTracks:
         """Select tracks by a mask."""
+        new = np.where(rows, np.cumsum(rows) - 1, -1)
         return CentralTracks(
             self.tracks[rows], self.has[rows], self.history[rows], self.updates[rows], self.hit_ever[rows],
-            self.supported_ns[rows], self.identities,
+            self.supported_ns[rows], self.identities, self.links.renumbered(new), self.twins.renumbered(new),
         )  # fmt: skip
 
 
@@ -94,7 +132,8 @@ class CentreState:
     def __post_init__(self) -> None:
         own = self.central
         _freeze(own.tracks)
-        for array in (own.has, own.history, own.updates, own.hit_ever, own.supported_ns):
+        tables = (*vars(own.links).values(), *vars(own.twins).values())
+        for array in (own.has, own.history, own.updates, own.hit_ever, own.supported_ns, *tables):
             array.setflags(write=False)
 
     def __setstate__(self, fields: Mapping[str, Any]) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
 
 from track_fusion.centre.associate import associate
 from track_fusion.centre.config import CentreConfig
+from track_fusion.centre.duplicates import merge
 from track_fusion.centre.fuse import fuse
 from track_fusion.centre.manage import manage
 from track_fusion.centre.pool import Pool, admitted
@@ -46,15 +48,17 @@ def step(
     fresh = np.zeros(sources, bool)
     fresh[list(scans)] = True
     pool = Pool.of(config, newest, before, fresh, time_ns)
-    association = associate(config, pool, fresh)
+    association = associate(config, pool, before.links, fresh)
     fused, random = fuse(config, pool, association, state.random)
     member = np.zeros((len(fused.tracks), sources), bool)
     member[association.target, pool.source[association.member]] = True
     supported_ns = np.full(len(fused.tracks), -1, np.int64)
     np.maximum.at(supported_ns, association.target, pool.stamp_ns[association.member])
     stamps = _noted(state.stamps, time_ns, scans)
-    central, changes = manage(config.manager, before, fused, member, fresh, supported_ns, stamps)
-    info = told(sources, pool, association, fused, changes)
+    linked = dataclasses.replace(before, links=association.links)
+    central, changes = manage(config.manager, linked, fused, member, fresh, supported_ns, stamps)
+    central, merged = merge(config, central)
+    info = told(sources, pool, association, fused, changes, merged)
     return CentreState(central, newest, stamps, random, time_ns), publish(config.params, central.tracks), info
 
 
