@@ -89,3 +89,14 @@ def test_what_is_turned_away_is_counted_and_told_once() -> None:
         list(centre.take(0, table(SECOND, 0.0, "odom"), SECOND))
     assert error.value.reason == "wrong_frame"
     assert centre.counts.counted["steps"] == 1
+
+
+def test_a_source_that_strays_is_counted() -> None:
+    centre = made(trigger="all_sources")
+    for k in range(12):  # the second strays for three scans, and for good from the ninth
+        for source, x in (0, 0.0), (1, 60.0 if k in (3, 4, 5) or k >= 9 else 0.0):
+            now_ns = (k + 10) * SECOND // 10
+            list(centre.take(source, table(now_ns, x), now_ns))
+    counted = centre.counts.counted
+    assert (counted["steps"], counted["held"], counted["released"], counted["merged"]) == (12, 6, 0, 0)
+    assert len(centre.centre.tracks) == 1

@@ -214,10 +214,11 @@ class MessageCentre:
         counted = self.counts.counted
         for result in self.centre.advance(now_ns):
             self.counts.reject(result.kept_out, "a newer scan of the source came before its fusion, or it was too old")
+            info = result.info
             counted["steps"] += 1
-            counted["unconverged"] += result.info.unconverged
-            counted["unsound"] += result.info.unsound
-            counted["beyond_half_circle"] += result.info.beyond_half_circle
-            counted["deleted"] += len(result.info.changes.deleted)
-            counted["dropped_tentative"] += len(result.info.changes.dropped)
+            for name in ("unconverged", "unsound", "beyond_half_circle", "held", "released"):
+                counted[name] += getattr(info, name)
+            counted["deleted"] += len(info.changes.deleted)
+            counted["dropped_tentative"] += len(info.changes.dropped)
+            counted["merged"] += len(info.merged)
             yield result
