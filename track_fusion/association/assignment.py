@@ -15,6 +15,8 @@ from track_fusion.linalg import Array
 
 #: A component with more cells than this (32 MB of costs) is solved in sparse form.
 DENSE_CELLS = 4_000_000
+#: The components of so few pairs are found in plain numbers, which spares the overhead of a graph.
+FEW_PAIRS = 128
 
 
 def assign(candidates: Candidates, rows: int, cols: int, gamma: float) -> Indices:
@@ -49,11 +51,30 @@ def assign(candidates: Candidates, rows: int, cols: int, gamma: float) -> Indice
 
 def _components(row: Indices, col: Indices, rows: int, cols: int) -> list[NDArray[np.intp]]:
     """Group the pairs by connected component of the bipartite graph."""
-    graph = coo_array((np.ones(len(row), np.int8), (row, col + rows)), shape=(rows + cols,) * 2)
-    label = connected_components(graph, directed=False)[1][row]
+    if len(row) <= FEW_PAIRS:
+        label = _labels(row.tolist(), (col + rows).tolist())
+    else:
+        graph = coo_array((np.ones(len(row), np.int8), (row, col + rows)), shape=(rows + cols,) * 2)
+        label = np.asarray(connected_components(graph, directed=False)[1][row], np.intp)
     order = np.argsort(label, kind="stable")
     cuts = np.flatnonzero(np.diff(label[order])) + 1
     return list(np.split(order, cuts))
+
+
+def _labels(first: list[int], second: list[int]) -> NDArray[np.intp]:
+    """Label edges between nodes by their component: of each the number of one edge of it."""
+    parent = list(range(len(first)))
+    edge_of: dict[int, int] = {}
+
+    def root(edge: int) -> int:
+        while parent[edge] != edge:
+            parent[edge] = edge = parent[parent[edge]]
+        return edge
+
+    for edge, ends in enumerate(zip(first, second, strict=True)):
+        for node in ends:
+            parent[root(edge_of.setdefault(node, edge))] = root(edge)
+    return np.array([root(edge) for edge in parent], np.intp)
 
 
 def _solve(chosen: Indices, row: Indices, col: Indices, cost: Array, miss: float) -> None:

@@ -16,6 +16,8 @@ Indices = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 #: Up to so many pairs, all are tried: a tree would cost more than it saves.
 TRY_ALL = 4096
+#: Of more pairs than this, those whose positions lie too far apart are left out first, which costs little.
+TRY_EXACTLY = 64
 #: Exact gating works on pieces of so many pairs, to bound memory.
 PIECE = 65536
 #: Rows that one search of the tree looks for; each may be near every column.
@@ -64,6 +66,9 @@ def gate(
     """
     if len(row_mean) * len(col_mean) <= TRY_ALL or not position:
         row, col = np.divmod(np.arange(len(row_mean) * len(col_mean)), max(len(col_mean), 1))
+        if position and len(row) > TRY_EXACTLY:
+            close = _is_close(row_mean, row_cov, col_mean, col_cov, gamma, list(position)).ravel()
+            row, col = row[close], col[close]
         pieces = [_looked_at(row[i : i + PIECE], col[i : i + PIECE], may) for i in range(0, max(len(row), 1), PIECE)]
         return joined(*(within(row_mean, row_cov, col_mean, col_cov, *piece, gamma, periods) for piece in pieces))
     near = (_looked_at(*piece, may) for piece in _near(row_mean, row_cov, col_mean, col_cov, gamma, list(position)))
@@ -104,6 +109,15 @@ def within(
     inside = np.flatnonzero(distance <= gamma)
     volume = 2.0 * np.log(np.diagonal(lower[inside], axis1=-2, axis2=-1)).sum(-1)
     return Candidates(row[inside], col[inside], distance[inside], volume)
+
+
+def _is_close(
+    row_mean: Array, row_cov: Array, col_mean: Array, col_cov: Array, gamma: float, position: list[int]
+) -> Bools:
+    """Tell which positions are close enough for the gate, (M, N): |dp|^2 <= gamma (trace of S), as in `_near`."""
+    gap = ((row_mean[:, None, position] - col_mean[:, position]) ** 2).sum(-1)
+    row_trace, col_trace = (cov[:, position, position].sum(-1) for cov in (row_cov, col_cov))
+    return np.asarray(gap <= gamma * (1.0 + 1e-9) * (row_trace[:, None] + col_trace))
 
 
 def _near(
