@@ -130,8 +130,10 @@ def test_a_miss_is_cheaper_than_a_pair_that_makes_another_miss_its_own():
 def test_sparse_solution_equals_dense(seed, monkeypatch):
     rng = np.random.default_rng(seed)
     found = gate(*scene(rng, 70, 60, 0.1), *scene(rng, 60, 60, 0.1), GAMMA, POSITION)
+    monkeypatch.setattr(assignment, "FEW_COMPONENTS", 10**9)
+    monkeypatch.setattr(assignment, "FEW_PAIRS", 10**9)
     dense = assign(found, 70, 60, GAMMA)
-    monkeypatch.setattr(assignment, "DENSE_CELLS", 0)
+    monkeypatch.setattr(assignment, "FEW_COMPONENTS", 0)
     np.testing.assert_array_equal(assign(found, 70, 60, GAMMA), dense)
     assert (dense < 0).any()
 
@@ -240,5 +242,5 @@ def test_components_are_those_of_a_graph_search(seed):
         wanted.add(frozenset(k for k, i in enumerate(row.tolist()) if ("row", i) in part))
         left -= part
     for repeats in (1, 1 + assignment.FEW_PAIRS // count):  # the second goes by the graph
-        parts = assignment._components(np.tile(row, repeats), np.tile(col, repeats), 60, 60)
-        assert {frozenset((part % count).tolist()) for part in parts} == wanted
+        label = assignment._components(np.tile(row, repeats), np.tile(col, repeats), 60, 60)
+        assert {frozenset((np.flatnonzero(label == k) % count).tolist()) for k in set(label.tolist())} == wanted
