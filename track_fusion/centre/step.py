@@ -52,5 +52,5 @@ def step(
     supported_ns = np.full(len(fused.tracks), -1, np.int64)
     np.maximum.at(supported_ns, association.target, pool.stamp_ns[association.member])
     central, changes = manage(config.manager, before, fused, member, fresh, supported_ns)
-    info = told(sources, pool, association, fused, changes)
+    info = told(pool, association, fused, before, changes)
     return CentreState(central, newest, random, time_ns), publish(config.params, central.tracks), info
