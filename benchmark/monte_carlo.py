@@ -8,8 +8,8 @@ import numpy as np
 
 from benchmark.baselines import two_filters_and_intersection_looped
 from benchmark.measure import Result, race
-from track_fusion.scenarios.li2022.linear import RULE_CHOICES, TRACKING, kalman_row
-from track_fusion.study.one_target import drawn
+from track_fusion.scenarios.li2022.linear import KF, RULE_CHOICES, TRACKING
+from track_fusion.study.one_target import drawn, fused_row
 
 RUNS = 1000
 #: The loop is timed on so many runs and scaled up.
@@ -26,7 +26,7 @@ def run() -> Iterator[Result]:
         weight = 0.5 if choice.variant == "uniform" else None
 
         def study(choice=choice):
-            return [fused.mean for fused in kalman_row(choice).estimates(draws)]
+            return [fused.mean for fused in fused_row(TRACKING, KF, choice).estimates(draws)]
 
         def loop(weight=weight):
             return two_filters_and_intersection_looped(

@@ -20,6 +20,7 @@ from track_fusion.angles import (
     interpolate,
     moments,
     most_certain,
+    named_period,
     periods_of,
     shifted,
     within_half_circle,
@@ -259,6 +260,10 @@ def test_periods_follow_from_names_unless_given() -> None:
     for wrong in ((TURN,), (np.inf, 0.0), (np.inf, np.nan)):
         with pytest.raises(ValueError, match="must be 2 numbers > 0, infinite where an axis does not wrap. Got"):
             StateLayout(("x", "yaw"), wrong)
+
+
+def test_an_angular_axis_is_spelt_with_pi_where_its_sign_is_unknown() -> None:
+    assert [named_period(spelt) for spelt in ("psi", "yaw:pi")] == [("psi", TURN), ("yaw", HALF_TURN)]
 
 
 def test_a_part_of_a_layout_keeps_its_periods() -> None:

@@ -20,8 +20,8 @@ from track_fusion.plugins import Registry
 
 if TYPE_CHECKING:
     from track_fusion.models.choices import Choice
-    from track_fusion.scenarios import Scenario
     from track_fusion.study.claim import Claim
+    from track_fusion.study.scenario import Scenario
 
 SOURCE_TREE = Path(__file__).parents[1]
 LINE_WIDTH = 120

@@ -8,7 +8,9 @@ back onto the reference. So turning everything by an angle turns the result by t
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +26,8 @@ HALF_TURN = np.pi
 KNOWN_PERIODS: Mapping[str, float] = dict.fromkeys(
     ("yaw", "heading", "course", "roll", "pitch", "bearing", "azimuth", "elevation"), TURN
 )
+#: What a user writes behind the name of a direction whose sign is unknown.
+SIGN_UNKNOWN = ":pi"
 #: States this close to opposite, in the unit of the axis, have no mean direction: rounding would decide.
 OPPOSITE = 1e-6
 
@@ -47,16 +51,32 @@ def periods_of(axes: Sequence[str], wraps: Mapping[str, float] | None = None) ->
     return tuple(float(wraps.get(a, KNOWN_PERIODS.get(a, np.inf))) for a in axes)
 
 
+def named_period(spelt: str) -> tuple[str, float]:
+    """Read an angular axis as users spell it: `psi` wraps after a turn, `psi:pi`, its sign unknown, after half a turn.
+
+    Returns
+    -------
+    name, period
+    """
+    name = spelt.removesuffix(SIGN_UNKNOWN)
+    return name, TURN if name == spelt else HALF_TURN
+
+
+def wraps(periods: Any) -> bool:
+    """Tell whether any axis wraps; quickly, since most states have none that does."""
+    return any(map(math.isfinite, periods)) if isinstance(periods, Iterable) else math.isfinite(periods)
+
+
 def wrap(values: ArrayLike, periods: ArrayLike) -> Array:
     """Bring values (...), or (..., n), to [-period/2, period/2); those that lie there stay, to the last digit.
 
     `periods` is one number, or (n,). Without a value to bring the array itself is returned.
     """
-    values, periods = np.asarray(values, np.float64), np.asarray(periods, np.float64)
-    wrapping = np.isfinite(periods)
-    if not wrapping.any():
+    values = np.asarray(values, np.float64)
+    if not wraps(periods):
         return values
-    outside = wrapping & ((values < -0.5 * periods) | (values >= 0.5 * periods))
+    periods = np.asarray(periods, np.float64)
+    outside = np.isfinite(periods) & ((values < -0.5 * periods) | (values >= 0.5 * periods))
     if not outside.any():
         return values
     period = np.broadcast_to(periods, outside.shape)[outside]
@@ -89,11 +109,11 @@ def center(weight: Array, mean: Array, periods: ArrayLike) -> Array:
     In axes that wrap it is the direction of the sum of their unit vectors, which a wide cloud has, too; in the others,
     and where the vectors cancel, that of the heaviest.
     """
-    wraps = np.isfinite(periods)
-    phase = np.where(wraps, TURN / np.asarray(periods, np.float64), 0.0)
+    wrapping = np.isfinite(periods)
+    phase = np.where(wrapping, TURN / np.asarray(periods, np.float64), 0.0)
     total = np.einsum("...k,...kn->...n", weight, np.exp(1j * phase * mean))
-    clear = wraps & (np.abs(total) > OPPOSITE * weight.sum(-1)[..., None])
-    return np.where(clear, np.angle(total) / np.where(wraps, phase, 1.0), heaviest(weight, mean))
+    clear = wrapping & (np.abs(total) > OPPOSITE * weight.sum(-1)[..., None])
+    return np.where(clear, np.angle(total) / np.where(wrapping, phase, 1.0), heaviest(weight, mean))
 
 
 def most_certain(mean: Array, cov: Array) -> Array:
@@ -139,7 +159,7 @@ def moments(weight: Array, mean: Array, cov: Array, periods: ArrayLike) -> tuple
     Notes     Beyond a half circle another reference gives another result.
     """
     weight = weight / weight.sum(-1, keepdims=True)
-    if not np.isfinite(periods).any():
+    if not wraps(periods):
         return merged_moments(mean, cov, weight)
     reference = center(weight, mean, periods)
     shift, merged = merged_moments(difference(mean, reference[..., None, :], periods), cov, weight)
@@ -151,7 +171,7 @@ def sample_moments(weight: Array, points: Array, periods: ArrayLike) -> tuple[Ar
 
     Shapes (..., S), sum one, (..., S, n), and (n,), or empty: no axis wraps.
     """
-    if not np.isfinite(periods).any():
+    if not wraps(periods):
         return linalg.sample_moments(weight, points)
     reference = center(weight, points, periods)
     shift, cov = linalg.sample_moments(weight, difference(points, reference[..., None, :], periods))

@@ -165,7 +165,9 @@ RIDGE = 1e-12
 
 def is_well_conditioned(cov: Array) -> NDArray[np.bool_]:
     """Tell which covariances are positive definite by more than rounding, (..., n, n) -> (...)."""
-    return is_positive_definite(cov * (1.0 - RIDGE * np.eye(cov.shape[-1])))
+    n, reduced = cov.shape[-1], np.array(cov, order="C")
+    reduced.reshape(*cov.shape[:-2], n * n)[..., :: n + 1] *= 1.0 - RIDGE  # the diagonals
+    return is_positive_definite(reduced)
 
 
 def _without_factor(cov: Array, start: int) -> list[int]:

@@ -113,6 +113,8 @@ class TrackBatch:
     def sound(self) -> NDArray[np.bool_]:
         """Tell which tracks are densities that a reader takes, (N,), whatever their identifiers."""
         good = np.ones(len(self), bool)
+        if not len(good) or _is_density(self):
+            return good
         for bad in _faults(self.replace(track_id=np.arange(len(self)))).values():
             good &= ~bad
         return good
@@ -166,11 +168,13 @@ class TrackBatch:
     def replace(self, **fields: Any) -> TrackBatch:
         """Return a batch with some arrays exchanged for computed ones of the same N; not checked again."""
         batch = object.__new__(TrackBatch)
-        vars(batch).update(vars(self) | fields)
+        own = vars(batch)
+        own.update(vars(self))
+        own.update(fields)
         if "cov" in fields:
-            vars(batch).pop("well_conditioned", None)
+            own.pop("well_conditioned", None)
         if "cov" in fields or "mean" in fields or "weight" in fields:
-            vars(batch).pop("moments", None)
+            own.pop("moments", None)
         return batch
 
     def owned(self) -> TrackBatch:
@@ -178,9 +182,10 @@ class TrackBatch:
         batch = self.replace()
         for name in ROW_FIELDS if self.uuid is None else (*ROW_FIELDS, "uuid"):
             array = getattr(self, name)
-            if array.flags.writeable or not array.flags.owndata:
-                vars(batch)[name] = array.copy()
-                vars(batch)[name].setflags(write=False)
+            flags = array.flags
+            if flags.writeable or not flags.owndata:
+                vars(batch)[name] = array = array.copy()
+                array.setflags(write=False)
         return batch
 
     def __getitem__(self, index: Any) -> TrackBatch:
@@ -313,24 +318,26 @@ def _faults(batch: TrackBatch) -> dict[str, NDArray[np.bool_]]:
 
 def _is_clean(batch: TrackBatch) -> bool:
     """Tell quickly that no track is bad; false when a track may be (it is looked at closely then)."""
-    if not len(batch):
+    ids = batch.track_id
+    if not len(ids):
         return True
+    unique = ids.min() >= 0 and ids.max() <= 0xFFFFFFFF and (len(ids) == 1 or len(np.unique(ids)) == len(ids))
+    return bool(unique and _is_density(batch))
+
+
+def _is_density(batch: TrackBatch) -> bool:
+    """Tell quickly that every track, one at least, is a density, whatever its identifier; false when one may not be."""
     mean, cov, weight = batch.mean, batch.cov, batch.weight
     # Comparisons are false for NaN, so that these refuse it as well.
     if not (mean.max() <= ABSURD and mean.min() >= -ABSURD and cov.max() <= ABSURD**2 and cov.min() >= -(ABSURD**2)):
         return False
-    normal = batch.phd or np.abs(weight.sum(1) - 1.0).max() <= WEIGHT_TOLERANCE
-    existence, ids = batch.existence, batch.track_id
+    total, existence = weight.sum(1), batch.existence
     return bool(
-        normal
+        (total.min() > 0 if batch.phd else np.abs(total - 1.0).max() <= WEIGHT_TOLERANCE)
         and weight.min() >= 0
         and existence.min() >= 0
         and existence.max() <= 1
         and batch.dof.min() > 2
-        and ids.min() >= 0
-        and ids.max() <= 0xFFFFFFFF
-        and (len(ids) == 1 or len(np.unique(ids)) == len(ids))
-        and (weight.sum(1).min() > 0 if batch.phd else True)
         and (cov == transpose(cov)).all()
         and (batch.well_conditioned.all() if cov.any() else (weight > 0).sum(1).min() > 1)
     )

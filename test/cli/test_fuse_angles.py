@@ -37,6 +37,13 @@ def test_known_names_wrap_and_others_that_are_named(given: Any) -> None:
     assert answer["mean"] == [pytest.approx(10.0), pytest.approx(-np.pi)]
 
 
+def test_boxes_whose_front_is_unknown_have_the_mean_of_their_sides() -> None:
+    tracks = [{"mean": [0.0, yaw], "cov": COV} for yaw in (1.0, 1.0 - np.pi)]
+    answer, said = fuse(tracks=tracks, axes=["x", "yaw"], angular=["yaw:pi"])
+    assert (answer["mean"], said) == ([0.0, pytest.approx(1.0)], "")
+    assert answer["info"]["beyond_half_circle"] is False
+
+
 def test_opposite_headings_are_flagged() -> None:
     tracks = [{"mean": [0.0, yaw], "cov": COV} for yaw in (0.0, 3.141592)]
     assert fuse(tracks=tracks, axes=["x", "yaw"])[0]["info"]["beyond_half_circle"] is True
@@ -79,6 +86,8 @@ def test_other_numbers_are_not(given: Any) -> None:
         ({"axes": ["x", "x"]}, 'axes: must be distinct names; got ["x", "x"]'),
         ({"angular": ["psi"]}, "axes: is missing; 'angular' names some of them"),
         ({"axes": ["x", "psi"], "angular": ["phi"]}, 'angular[0]: must be one of the axes x, psi; got "phi"'),
+        ({"axes": ["x", "psi"], "angular": ["psi:2"]}, 'angular[0]: must be one of the axes x, psi; got "psi:2"'),
+        ({"axes": ["x", "psi"], "angular": ["psi", "psi:pi"]}, 'angular[1]: names psi once more; got "psi:pi"'),
     ],
 )
 def test_wrong_names_are_refused(given: Any, line: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from track_fusion.angles import HALF_TURN, difference
 from track_fusion.metrics.truth import Truth, interpolated
 from track_fusion.tracks import SECOND_NS, StateLayout, planar_layout
 
@@ -55,6 +56,14 @@ def test_angles_go_the_short_way_and_turn_with_the_circle(shift: float, share: f
     want = 3.1 + shift + share * (2 * np.pi - 6.2)
     assert np.exp(1j * got) == pytest.approx(np.exp(1j * np.array([want])))
     assert -np.pi <= got[0] < np.pi
+
+
+@pytest.mark.parametrize("share", SHARES)
+def test_a_direction_whose_sign_is_unknown_goes_the_short_way_of_its_own_period(share: float) -> None:
+    layout = StateLayout(("yaw",), (HALF_TURN,))
+    got = interpolated(layout, np.array([1.5]), np.array([-1.5]), 1.0, share)
+    assert -0.5 * HALF_TURN <= got[0] < 0.5 * HALF_TURN
+    assert difference(got, 1.5 + share * (HALF_TURN - 3.0), HALF_TURN) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_known_turn_rate_tells_which_way_round() -> None:

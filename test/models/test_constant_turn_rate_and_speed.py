@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from mpmath import mp
 from scipy.integrate import solve_ivp
 
+from track_fusion.angles import HALF_TURN
 from track_fusion.linalg import Array
 from track_fusion.models.choices import MOTIONS, make
 from track_fusion.models.constant_turn_rate_and_speed import ConstantTurnRateAndSpeed, TurnRateAndSpeedParams
@@ -204,3 +205,9 @@ def test_other_axes_are_refused(axes: tuple[str, ...]) -> None:
         make(MOTIONS, "constant_turn_rate_and_speed", PARAMS, StateLayout(axes))
     wanted = "Constant turn rate and speed needs axes x, y, yaw, speed, turn_rate"
     assert str(caught.value) == f"{wanted}. Got {', '.join(axes)}."
+
+
+def test_a_yaw_of_unknown_sign_is_refused() -> None:
+    layout = StateLayout(LAYOUT.axes, tuple(HALF_TURN if axis == "yaw" else np.inf for axis in LAYOUT.axes))
+    with pytest.raises(ValueError, match="needs a yaw that tells front from back. Got one of period pi."):
+        make(MOTIONS, "constant_turn_rate_and_speed", PARAMS, layout)

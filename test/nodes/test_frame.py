@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from track_fusion.angles import TURN
+from track_fusion.angles import HALF_TURN, TURN
 from track_fusion.nodes.screening import FrameParams
 from track_fusion.params import ParameterError
 
@@ -16,7 +16,19 @@ def test_known_names_and_named_axes_wrap() -> None:
     np.testing.assert_array_equal(frame.layout.periods, [np.inf, TURN, TURN, np.inf])
 
 
-def test_what_wraps_must_be_an_axis() -> None:
+def test_directions_of_unknown_sign_have_half_the_period() -> None:
+    frame = FrameParams(axes=("x", "yaw", "psi", "phi"), angular=("yaw:pi", "psi:pi"))
+    np.testing.assert_array_equal(frame.layout.periods, [np.inf, HALF_TURN, HALF_TURN, np.inf])
+
+
+@pytest.mark.parametrize("spelt", ["psi", "psi:pi", "x:2"])
+def test_what_wraps_must_be_an_axis(spelt: str) -> None:
     with pytest.raises(ParameterError) as caught:
-        FrameParams(axes=("x", "y"), angular=("psi",))
-    assert str(caught.value) == "The 'angular' parameter must name axes of x, y. Got 'psi'."
+        FrameParams(axes=("x", "y"), angular=(spelt,))
+    assert str(caught.value) == f"The 'angular' parameter must name axes of x, y. Got {spelt!r}."
+
+
+def test_an_axis_has_one_period() -> None:
+    with pytest.raises(ParameterError) as caught:
+        FrameParams(axes=("x", "yaw"), angular=("yaw", "yaw:pi"))
+    assert str(caught.value) == "The 'angular' parameter must name an axis once. Got 'yaw:pi' after another 'yaw'."

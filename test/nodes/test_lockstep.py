@@ -173,7 +173,7 @@ def start_relayed(nodes: Nodes, overrides: Mapping[str, Mapping[str, Any]], step
 def library(rule: str | None) -> NDArray[np.float64]:
     """Run the library on the same draws: estimated states of all steps, (T, n)."""
     tracking = li2022_linear.TRACKING
-    row = li2022_linear.kalman_rows()[f"kf-{rule or 'alone'}"]
+    row = li2022_linear.KALMAN_ROWS[f"kf-{rule or 'alone'}"]
     return np.array([fused.mean[0] for fused in row.estimates(drawn(tracking, [RUN], SEED))])
 
 

@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 
 from track_fusion.demo.wiring import Bringup, bringups
 from track_fusion.rules import RULES, get_rule
-from track_fusion.scenarios import RuleChoice, get_scenario
+from track_fusion.scenarios import get_scenario
 from track_fusion.scenarios.chen2022.dynamic import fusions
 from track_fusion.scenarios.li2022 import linear as li2022_linear
 from track_fusion.scenarios.li2022 import nonlinear as li2022_nonlinear
 from track_fusion.scenarios.sharma import radar_runs as sharma_radar_runs
 from track_fusion.study.one_target import Row, alone_row, drawn, fused_row, sir_filters
+from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.tracks import TrackBatch
 
 TOLERANCE = 1e-9

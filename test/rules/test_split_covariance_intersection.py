@@ -11,14 +11,14 @@ from scipy.optimize import minimize
 
 from track_fusion.linalg import Array
 from track_fusion.rules import FusedTracks, SourceTracks, get_rule
-from track_fusion.rules.split_covariance_intersection import RULE, SplitCovarianceIntersectionParams
+from track_fusion.rules.split_covariance_intersection import RULE
 
 CRITERIA = pytest.mark.parametrize("criterion", ["det", "trace"])
 COUNTS = pytest.mark.parametrize("count", [2, 3, 5])
 
 
 def fuse(mean: Array, cov: Array, alone: Array, **params: Any) -> FusedTracks:
-    return RULE(SourceTracks(mean, cov, extras={"independent_cov": alone}), SplitCovarianceIntersectionParams(**params))
+    return RULE(SourceTracks(mean, cov, extras={"independent_cov": alone}), RULE.params(**params))
 
 
 def drawn(rng: np.random.Generator, batch: int, count: int, rank: int = 2) -> tuple[Array, Array, Array]:

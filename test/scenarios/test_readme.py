@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from track_fusion.scenarios import SCENARIOS, judged_claims, judged_figures
+from track_fusion.scenarios import SCENARIOS
+from track_fusion.study.judgement import judged_claims, judged_figures
 
 README = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
 STATEMENTS = re.sub(r"\s+", " ", README.partition("## Published studies, repeated")[2].partition("## More")[0])

@@ -8,10 +8,10 @@ from filters.plain import Plain
 
 from track_fusion.filters.cubature import Cubature
 from track_fusion.rules import RULES, SourceTracks
-from track_fusion.scenarios import RuleChoice
 from track_fusion.scenarios.li2022 import linear as li2022_linear
 from track_fusion.scenarios.li2022 import nonlinear as li2022_nonlinear
 from track_fusion.study.one_target import drawn
+from track_fusion.study.rule_choice import RuleChoice
 
 RUNS = 100
 #: sd of one 100-run table, position, from 500 runs of our own times sqrt(5).

@@ -14,10 +14,10 @@ from track_fusion.linalg import transpose
 from track_fusion.metrics.accuracy import Estimate, armse
 from track_fusion.params import ParameterError
 from track_fusion.rules import RULES, SourceTracks
-from track_fusion.scenarios import SCENARIOS, get_scenario, judged_figures
+from track_fusion.scenarios import SCENARIOS, get_scenario
 from track_fusion.scenarios.ahmed import search as ahmed_search
 from track_fusion.study.claim import Claim, ascending
-from track_fusion.study.judgement import judged_claim, judged_figure
+from track_fusion.study.judgement import judged_claim, judged_figure, judged_figures
 from track_fusion.study.rule_choice import RuleChoice, check_needs, fuse_runs, rule_by_rule
 from track_fusion.study.scenario import Printed, Scenario
 

@@ -181,8 +181,9 @@ def predicted_to(batch: TrackBatch, time_ns: int, motion: Motion) -> TrackBatch:
     if (batch.time_ns == time_ns).all():
         return batch
     mean, cov = np.empty_like(batch.mean), np.empty_like(batch.cov)
-    for stamp in np.unique(batch.time_ns):
-        at = batch.time_ns == stamp
+    alike = bool((batch.time_ns == batch.time_ns[0]).all())
+    for stamp in batch.time_ns[:1] if alike else np.unique(batch.time_ns):
+        at = ... if alike else batch.time_ns == stamp
         transition = motion.over((time_ns - int(stamp)) / SECOND_NS)
         mean[at], cov[at] = Extended().predict(Gaussian(batch.mean[at], batch.cov[at]), transition).moments
     return batch.replace(mean=wrap(mean, batch.layout.periods), cov=cov, time_ns=np.full(len(batch), time_ns))

@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from track_fusion.metrics.significance import Difference
-    from track_fusion.scenarios import Outcomes, Scenario
     from track_fusion.study.comparison import Group, Score
+    from track_fusion.study.rows import Outcomes
+    from track_fusion.study.scenario import Scenario
     from track_fusion.study.study import RuleSpec
 
 #: What the numbers of a group are, where smaller is not better.

@@ -26,7 +26,7 @@ def fuse(rule: str, params: str) -> None:
     Beside "tracks" may stand
       "axes"        names of the axes: yaw, heading, course, roll, pitch, bearing, azimuth, elevation are angles in
                     radians and wrap, all others do not
-      "angular"     names of further axes that are angles in radians
+      "angular"     names of further axes that are angles in radians; "yaw:pi": its sign is unknown, its period pi
 
     \b
     Where the rule needs it, and only there (see "needs" in `track-fusion rules`), in each TRACK

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from track_fusion.report.page import Section
-    from track_fusion.scenarios import Scenario
+    from track_fusion.study.scenario import Scenario
     from track_fusion.study.study import Result, Study
 
 #: Colours of the verdicts in the table.
@@ -134,7 +134,8 @@ def _is_undecided(section: Section) -> bool:
 def _section(result: Result) -> Section:
     """Judge a study: what --json prints, and what goes with it on the page."""
     from track_fusion.report.page import Section
-    from track_fusion.scenarios import find_scenario, judged_claims, judged_figures
+    from track_fusion.scenarios import find_scenario
+    from track_fusion.study.judgement import judged_claims, judged_figures
 
     study, scenario = result.study, find_scenario(result.study.scenario)
     measured = scenario.figures(result.outcomes)

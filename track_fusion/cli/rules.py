@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import click
+from rich.markup import escape
+from rich.table import Table
 
+from track_fusion.cli.output import console, grid, parameters, print_json, shown_default, table
 from track_fusion.params import ParameterError
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from track_fusion.rules import Rule
 
 
@@ -34,7 +35,6 @@ def rules(ctx: click.Context, name: str | None, as_json: bool) -> None:
       track-fusion rules --json | jq '.[] | {key, guarantee}'
       track-fusion rules --check ./best_track.py
     """  # noqa: D301  click reads \b as "do not wrap"
-    from track_fusion.cli.output import print_json
     from track_fusion.rules import RULES
 
     if name is not None:
@@ -53,9 +53,6 @@ def rules(ctx: click.Context, name: str | None, as_json: bool) -> None:
 
 def _check(name: str, as_json: bool) -> int:
     """Hold a rule against the laws, print what became of each, and return 1 if it breaks one."""
-    from rich.markup import escape
-
-    from track_fusion.cli.output import console, print_json, table
     from track_fusion.rules import find_rule
     from track_fusion.rules.contract import check
 
@@ -73,8 +70,6 @@ def _check(name: str, as_json: bool) -> int:
 
 def describe(rule: Rule) -> dict[str, Any]:
     """Return what the registry says of a rule, its parameters included."""
-    from track_fusion.cli.output import parameters
-
     names = ("key", "title", "family", "arity", "caveat", "order_matters", "needs",
              "needs_when", "optional", "affine_equivariant")  # fmt: skip
     return {
@@ -106,10 +101,6 @@ def facts(rule: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _print_tables(described: list[dict[str, Any]]) -> None:
-    from rich.markup import escape
-
-    from track_fusion.cli.output import console, grid, table
-
     out = console()
     summary = table("rule", "family", "tracks", "guarantee", title=f"{len(described)} fusion rules")
     for rule in described:
@@ -123,10 +114,6 @@ def _print_tables(described: list[dict[str, Any]]) -> None:
 
 
 def _parameter_table(parameters: list[dict[str, Any]]) -> Table:
-    from rich.markup import escape
-
-    from track_fusion.cli.output import shown_default, table
-
     shown = table("parameter", "default", "value", "meaning")
     for p in parameters:
         unit = f" [{p['unit']}]" if p["unit"] else ""

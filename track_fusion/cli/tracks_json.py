@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from track_fusion.angles import HALF_TURN, TURN, periods_of, wrap
+from track_fusion.angles import HALF_TURN, TURN, named_period, periods_of, wrap
 from track_fusion.cli.tracks_schema import InputError, check, shared_schema, tracks_schema
 from track_fusion.densities.mixture.mixture import moments, padded
 from track_fusion.linalg import ASYMMETRY_TOLERANCE, Array, asymmetric, is_positive_definite, outer, symmetrise
@@ -130,10 +130,15 @@ def _periods(data: Mapping[str, Any]) -> tuple[float, ...]:
     axes, angular = data["axes"], data.get("angular", [])
     if len(set(axes)) < len(axes):
         _fail("axes", f"must be distinct names; got {json.dumps(axes)}")
-    for k, name in enumerate(angular):
+    periods: dict[str, float] = {}
+    for k, spelt in enumerate(angular):
+        name, period = named_period(spelt)
         if name not in axes:
-            _fail(f"angular[{k}]", f"must be one of the axes {', '.join(axes)}; got {json.dumps(name)}")
-    return periods_of(axes, dict.fromkeys(angular, TURN))
+            _fail(f"angular[{k}]", f"must be one of the axes {', '.join(axes)}; got {json.dumps(spelt)}")
+        if name in periods:
+            _fail(f"angular[{k}]", f"names {name} once more; got {json.dumps(spelt)}")
+        periods[name] = period
+    return periods_of(axes, periods)
 
 
 # Densities.

@@ -9,7 +9,7 @@ from typing import Any
 from track_fusion.demo.plan import Demo
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.params import ParameterError
-from track_fusion.scenarios import judged_figures
+from track_fusion.study.judgement import judged_figures
 
 Figures = dict[str, Estimate]
 

@@ -9,7 +9,9 @@ from pathlib import Path
 from track_fusion.demo.wiring import Bringup, bringups
 from track_fusion.params import Fault, unknown_name_error
 from track_fusion.rules import get_rule
-from track_fusion.scenarios import SCENARIOS, Scenario, Scene, get_scenario
+from track_fusion.scenarios import SCENARIOS, get_scenario
+from track_fusion.study.scenario import Scenario
+from track_fusion.study.scene import Scene
 
 #: How a scenario's rows name what the tracker nodes run.
 ROWS = {

@@ -26,7 +26,11 @@ I_co = TypeVar("I_co", covariant=True)
 
 
 class Filter(Protocol[S, M_contra, Z_contra, H_contra, I_co]):
-    """Predicts and updates states of one kind, each with any leading axes, such as Monte Carlo runs."""
+    """Predicts and updates states of one kind, each with any leading axes, such as Monte Carlo runs.
+
+    Unless a filter says otherwise, states are of n axes, (..., n), z is a measurement, (..., m), and leading axes
+    broadcast.
+    """
 
     def predict(self, state: S, motion: M_contra, /) -> S:
         """Return the state moved by x' = f(x) + w."""

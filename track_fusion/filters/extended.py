@@ -12,13 +12,7 @@ class Linearising(GaussianFilter):
     """What the filters share that linearise motions at the mean."""
 
     def predict(self, state: Gaussian, transition: Transition) -> Gaussian:
-        """Predict x' = f(x) + w with f linearised at the mean; w has the covariance Q, whatever its tails.
-
-        Parameters
-        ----------
-        state : Gaussian    (..., n)
-        transition : Transition
-        """
+        """Predict x' = f(x) + w with f linearised at the mean; w has the covariance Q, whatever its tails."""
         slope = transition.jacobian(state.mean) if transition.matrix is None else transition.matrix
         cov = symmetrise(slope @ state.cov @ transpose(slope) + transition.noise(state.mean))
         return Gaussian(transition.advance(state.mean), cov, state.dof)
@@ -31,14 +25,7 @@ class Extended(Linearising):
     """
 
     def update(self, state: Gaussian, z: Array, sensor: Sensor) -> tuple[Gaussian, Innovation]:
-        """Condition on z = h(x) + v with h linearised at the mean; angles in the residual are wrapped.
-
-        Parameters
-        ----------
-        state : Gaussian    (..., n)
-        z : (..., m)
-        sensor : Sensor
-        """
+        """Condition on z = h(x) + v, (..., m), with h linearised at the mean; angles in the residual are wrapped."""
         slope = sensor.jacobian(state.mean)
         # The linear filter sees the measurement whose linearised residual is the true, wrapped one.
         equivalent = matvec(slope, state.mean) + sensor.residual(z, sensor.observe(state.mean))

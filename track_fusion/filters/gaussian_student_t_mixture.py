@@ -82,14 +82,7 @@ class GaussianStudentTMixture(Linearising):
         return Gaussian(mean, cov, self.dof)
 
     def update(self, state: Gaussian, z: Array, sensor: Sensor) -> tuple[Gaussian, Robustness]:
-        """Condition on z = h(x) + v, h linearised at the mean.
-
-        Parameters
-        ----------
-        state : Gaussian    (..., n)
-        z : (..., m)
-        sensor : Sensor
-        """
+        """Condition on z = h(x) + v, h linearised at the mean."""
         mean = state.mean
         residual = sensor.residual(z, sensor.observe(mean))
         lead, (n, m) = np.broadcast_shapes(mean.shape[:-1], z.shape[:-1]), (mean.shape[-1], z.shape[-1])

@@ -10,15 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from track_fusion.densities.log_domain import log_of
-from track_fusion.densities.mixture.mixture import Mixture
+from track_fusion.densities.log_domain import log_of, log_sum_exp, normalised
+from track_fusion.densities.mixture.mixture import LOG_2PI, Mixture
 from track_fusion.filters.base import Evidence, Gaussian
 from track_fusion.filters.extended import Extended
 from track_fusion.linalg import Array, cholesky, inverse, matvec, outer, solve, symmetrise, transpose
 from track_fusion.models.base import Transition
 from track_fusion.models.detection import SoftmaxDetector
 
-LOG_2PI = float(np.log(2.0 * np.pi))
 #: Newton's iteration for the mode of a component: at most so many steps, each halved at most so often.
 NEWTON_STEPS, HALVINGS = 50, 30
 #: The mode is reached when the next step is shorter than this, in standard deviations.
@@ -92,21 +91,13 @@ class NegativeInformation:
         (*lead, count, classes), n = log_weight.shape, mean.shape[-1]
         size = count * classes
         flat = log_weight.reshape(*lead, size)
-        top = flat.max(-1, keepdims=True)
-        weight = np.exp(flat - top)
-        total = weight.sum(-1, keepdims=True)
-        cut = Mixture(weight / total, mean.reshape(*lead, size, n), cov.reshape(*lead, size, n, n))
-        log_likelihood = (np.log(total) + top)[..., 0] - np.log(mixture.weight.sum(-1))
+        cut = Mixture(normalised(flat), mean.reshape(*lead, size, n), cov.reshape(*lead, size, n, n))
+        log_likelihood = log_sum_exp(flat) - np.log(mixture.weight.sum(-1))
         return cut, SampledEvidence(np.asarray(log_likelihood), share.reshape(*lead, size))
 
 
 def _split(
-    mixture: Mixture,
-    detector: SoftmaxDetector,
-    chance: Array,
-    used: NDArray[np.intp],
-    points: Array,
-    negligible: float,
+    mixture: Mixture, detector: SoftmaxDetector, chance: Array, used: NDArray[np.intp], points: Array, negligible: float
 ) -> tuple[Array, Array, Array, Array]:
     """Log-probability (..., M, C') of the event, mean, covariance and effective share of every component by class."""
     log_event, varying = _event(mixture, detector, chance, points, negligible)

@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from track_fusion.angles import sample_moments
 from track_fusion.densities.log_domain import log_of, log_sum_exp
-from track_fusion.densities.mixture.mixture import Mixture
+from track_fusion.densities.mixture.mixture import LOG_2PI, Mixture
 from track_fusion.filters.base import Density, Evidence
 from track_fusion.linalg import Array, cholesky, transpose
 from track_fusion.models.base import Sensor, Transition
 from track_fusion.params import param
 from track_fusion.random_streams import Generators, RandomParams, exponentials, normals, stream, uniforms
 
-LOG_2PI = float(np.log(2.0 * np.pi))
 #: The largest double below one.
 BELOW_ONE = float(np.nextafter(1.0, 0.0))
 #: The smallest weight of a component.
@@ -181,13 +180,7 @@ class Sir:
         return self._drawn(*density.moments, state.rng)
 
     def predict(self, state: SirState, transition: Transition) -> SirState:
-        """Move every particle, x' = f(x) + w, w drawn from N(0, Q).
-
-        Parameters
-        ----------
-        state : SirState    (..., N)
-        transition : Transition
-        """
+        """Move every particle (..., N), x' = f(x) + w, w drawn from N(0, Q)."""
         if (state.log_weight != state.log_weight[..., :1]).any():
             state = self._resampled(state, state.rng)
         points = state.points
@@ -196,13 +189,7 @@ class Sir:
         return dataclasses.replace(state, points=moved)
 
     def update(self, state: SirState, z: Array, sensor: Sensor) -> tuple[SirState, Evidence]:
-        """Weigh the particles by their likelihood of z = h(x) + v.
-
-        Parameters
-        ----------
-        state : SirState    (..., N)
-        z : (..., m)
-        sensor : Sensor
+        """Weigh the particles (..., N) by their likelihood of z = h(x) + v, (..., m).
 
         Notes    Several sensors are used one after the other, which multiplies their likelihoods, Li 2022 (46).
                  Weights cannot all vanish: they are kept by their logarithms.

@@ -90,25 +90,13 @@ class ProbabilisticDataAssociation:
     params: ClutterParams = ClutterParams()
 
     def predict(self, state: C, transition: Transition) -> C:
-        """Predict by one scan; a target may vanish.
-
-        Parameters
-        ----------
-        state : Candidate    (..., n)
-        transition : Transition
-        """
+        """Predict by one scan; a target may vanish."""
         moved = Extended().predict(Gaussian(state.mean, state.cov), transition)
         existence = state.existence * self.params.survival_probability
         return dataclasses.replace(state, mean=moved.mean, cov=moved.cov, existence=existence)
 
     def update(self, state: C, scan: Scan, sensor: Sensor) -> tuple[C, Association]:
         """Condition on a scan of which at most one detection is the target's, the rest clutter.
-
-        Parameters
-        ----------
-        state : Candidate    (..., n)
-        scan : Scan          (..., D)
-        sensor : Sensor
 
         Notes    Clutter is Poisson, uniform in the gate. The posterior mixture of D + 1 Gaussians is merged; but for
                  that and the linearisation it is exact. Another target's detections count as clutter, so targets

@@ -86,13 +86,7 @@ class SigmaPointFilter(GaussianFilter, ABC):
         """Return the points for n axes."""
 
     def predict(self, state: Gaussian, transition: Transition) -> Gaussian:
-        """Predict x' = f(x) + w: moments of f at the points, plus Q.
-
-        Parameters
-        ----------
-        state : Gaussian    (..., n)
-        transition : Transition
-        """
+        """Predict x' = f(x) + w: moments of f at the points, plus Q."""
         points = self.points(state.mean.shape[-1])
         moved = transition.advance(points.of(state.mean, cholesky(state.cov)))
         origin = moved[..., :1, :]
@@ -102,16 +96,10 @@ class SigmaPointFilter(GaussianFilter, ABC):
         return Gaussian(origin[..., 0, :] + shift, cov, state.dof)
 
     def update(self, state: Gaussian, z: Array, sensor: Sensor) -> tuple[Gaussian, Innovation]:
-        """Condition on z = h(x) + v by the joint Gaussian that the points give.
+        """Condition on z = h(x) + v, (..., m), by the joint Gaussian that the points give.
 
         Angles are averaged about the measurement of the mean. The posterior covariance is summed from the
         points' remaining deviations, so that it stays definite when all weights are positive.
-
-        Parameters
-        ----------
-        state : Gaussian    (..., n)
-        z : (..., m)
-        sensor : Sensor
         """
         points, mean = self.points(state.mean.shape[-1]), state.mean
         sigma = points.of(mean, cholesky(state.cov))

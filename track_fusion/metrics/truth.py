@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from track_fusion.angles import wrap
 from track_fusion.linalg import Array
 from track_fusion.tracks import SECOND_NS, StateLayout
 
@@ -141,7 +142,7 @@ def interpolated(layout: StateLayout, start: Array, end: Array, gap_s: float, sh
     span, turned = end - start, np.zeros(layout.size)
     for axis, rate in pairs:
         turned[axis] = 0.5 * gap_s * (start[rate] + end[rate]) if layout.angular[axis] else 0.0
-    span = turned + _short_way(layout, span - turned)
+    span = turned + wrap(span - turned, layout.periods)
     state = start + s * span
     followed = {axis for axis, _ in pairs}
     for axis, rate in pairs:
@@ -151,9 +152,4 @@ def interpolated(layout: StateLayout, start: Array, end: Array, gap_s: float, sh
         if rate not in followed:
             state[rate] = 6 * s * (1 - s) * span[axis] / gap_s
             state[rate] += (s - 1) * (3 * s - 1) * at_start + s * (3 * s - 2) * at_end
-    return _short_way(layout, state)
-
-
-def _short_way(layout: StateLayout, values: Array) -> Array:
-    """Bring the angles of a state, or of a difference, to [-pi, pi)."""
-    return np.where(layout.angular, np.remainder(values + np.pi, 2 * np.pi) - np.pi, values)
+    return wrap(state, layout.periods)

@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from track_fusion.angles import HALF_TURN
 from track_fusion.layouts import StateLayout
 from track_fusion.linalg import Array, transpose
 from track_fusion.models.base import Transition
@@ -57,6 +58,10 @@ class ConstantTurnRateAndSpeed:
         self._walk = random_walk(layout, AXES, params.random_walk_noise, wanted)
         self.layout, self.params = layout, params
         self._at = layout.indices(AXES)
+        if layout.periods[self._at[2]] == HALF_TURN:
+            raise ValueError(
+                "Constant turn rate and speed needs a yaw that tells front from back. Got one of period pi."
+            )
         self._others = [i for i in range(layout.size) if i not in self._at]
         self.over = lru_cache(maxsize=256)(self._over)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters.arrays import DetectionArrays, MessageError, TrackArrays
-from track_fusion.angles import KNOWN_PERIODS, TURN, periods_of
+from track_fusion.angles import KNOWN_PERIODS, named_period, periods_of
 from track_fusion.linalg import Array, is_positive_definite, symmetrise
 from track_fusion.params import ParameterError, Params, param
 from track_fusion.tracks import ABSURD, SECOND_NS, StateLayout, TrackBatch
@@ -27,7 +27,8 @@ class FrameParams(Params):
     angular: tuple[str, ...] = param(
         (),
         "further axes that are angles in radians and wrap at pi, beside those of known names: "
-        + ", ".join(KNOWN_PERIODS),
+        + ", ".join(KNOWN_PERIODS)
+        + "; 'yaw:pi' where the sign is unknown, as of a box: period pi",
         kind=str,
     )
     max_future_s: float = param(
@@ -36,14 +37,20 @@ class FrameParams(Params):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in self.angular:
+        names = [named_period(spelt)[0] for spelt in self.angular]
+        for k, (name, spelt) in enumerate(zip(names, self.angular, strict=True)):
             if name not in self.axes:
-                raise ParameterError(f"The 'angular' parameter must name axes of {', '.join(self.axes)}. Got {name!r}.")
+                axes = ", ".join(self.axes)
+                raise ParameterError(f"The 'angular' parameter must name axes of {axes}. Got {spelt!r}.")
+            if name in names[:k]:
+                raise ParameterError(
+                    f"The 'angular' parameter must name an axis once. Got {spelt!r} after another {name!r}."
+                )
 
     @property
     def layout(self) -> StateLayout:
         """The axes, and which of them wrap."""
-        return StateLayout(self.axes, periods_of(self.axes, dict.fromkeys(self.angular, TURN)))
+        return StateLayout(self.axes, periods_of(self.axes, dict(map(named_period, self.angular))))
 
     @property
     def max_future_ns(self) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
@@ -52,11 +51,6 @@ class SourceTracks:
         mixture = densities if densities.count > 1 else None
         return cls(*moments(densities, periods), mixture=mixture, extras=extras, periods=periods)
 
-    @property
-    def wraps(self) -> bool:
-        """Whether an axis wraps."""
-        return any(map(math.isfinite, self.periods))
-
     def relative_to(self, reference: Array) -> SourceTracks:
         """Tell the tracks, and the densities among the extras, relative to states (..., n): no axis wraps any more.
 
@@ -91,8 +85,8 @@ class SourceTracks:
     @property
     def flat(self) -> tuple[Array, Array]:
         """Mean (B, K, n) and cov (B, K, n, n), the leading axes as one."""
-        if self.mean.ndim == 2:
-            return self.mean[None], self.cov[None]
+        if self.mean.ndim <= 3:
+            return (self.mean, self.cov) if self.mean.ndim == 3 else (self.mean[None], self.cov[None])
         tail = self.cov.shape[-3:]
         return self.mean.reshape(-1, *tail[:2]), self.cov.reshape(-1, *tail)
 
@@ -108,6 +102,8 @@ class SourceTracks:
         batch = self.batch
 
         def shape(array: NDArray[Any]) -> NDArray[Any]:
+            if len(batch) == 1:
+                return array
             return array.reshape(batch + array.shape[1:]) if batch else array[0, ...]
 
         return FusedTracks(
@@ -227,7 +223,7 @@ class Rule:
         ------
         LinAlgError    a covariance is not positive definite
         """
-        if not tracks.wraps:
+        if not angles.wraps(tracks.periods):
             return self.fuse(tracks, params)
         reference = angles.most_certain(tracks.mean, tracks.cov)
         flat = tracks.relative_to(reference)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from track_fusion.linalg import Array
@@ -13,12 +11,7 @@ from track_fusion.rules.shared.folding import PairFusion, fold
 from track_fusion.solvers.pair import Pair
 
 
-@dataclasses.dataclass(frozen=True)
-class EllipsoidalIntersectionParams(Params):
-    """Ellipsoidal intersection has no parameters."""
-
-
-def fuse(tracks: SourceTracks, params: EllipsoidalIntersectionParams) -> FusedTracks:
+def fuse(tracks: SourceTracks, params: Params) -> FusedTracks:
     """Fuse pairs of Gaussian tracks by ellipsoidal intersection, in the order of the sources.
 
     P^-1 = P1^-1 + P2^-1 - C^-1, C the common part: along the axes of both covariances at once, the vaguer of the two.
@@ -27,7 +20,7 @@ def fuse(tracks: SourceTracks, params: EllipsoidalIntersectionParams) -> FusedTr
     Parameters
     ----------
     tracks : SourceTracks    mean (..., K, n), cov (..., K, n, n)
-    params : EllipsoidalIntersectionParams
+    params : Params          none
 
     Returns
     -------
@@ -60,7 +53,7 @@ RULE = Rule(
     key="ellipsoidal_intersection",
     title="Ellipsoidal intersection",
     fuse=fuse,
-    params=EllipsoidalIntersectionParams,
+    params=Params,
     family="gaussian",
     arity="pairwise",
     guarantee="none",

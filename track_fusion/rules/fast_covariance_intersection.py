@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from track_fusion.params import Params
 from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
 from track_fusion.rules.shared.weights import pooled_by
 from track_fusion.weights.pooling import chernoff_weights
 
 
-@dataclasses.dataclass(frozen=True)
-class FastCovarianceIntersectionParams(Params):
-    """Fast covariance intersection has no parameters."""
-
-
-def fuse(tracks: SourceTracks, params: FastCovarianceIntersectionParams) -> FusedTracks:
+def fuse(tracks: SourceTracks, params: Params) -> FusedTracks:
     """Fuse K Gaussian tracks by fast covariance intersection: P^-1 = sum of w_i P_i^-1 at the Chernoff weights.
 
     The fused density is as far, in Kullback-Leibler divergence relative to each, from every track that has a weight.
@@ -23,7 +16,7 @@ def fuse(tracks: SourceTracks, params: FastCovarianceIntersectionParams) -> Fuse
     Parameters
     ----------
     tracks : SourceTracks    mean (..., K, n), cov (..., K, n, n)
-    params : FastCovarianceIntersectionParams
+    params : Params          none
 
     Returns
     -------
@@ -49,7 +42,7 @@ RULE = Rule(
     key="fast_covariance_intersection",
     title="Fast covariance intersection",
     fuse=fuse,
-    params=FastCovarianceIntersectionParams,
+    params=Params,
     family="gaussian",
     arity="n_ary",
     guarantee="none",

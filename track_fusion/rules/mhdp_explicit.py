@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from track_fusion.densities.elliptical.spd_means import log_euclidean_mean
@@ -11,12 +9,7 @@ from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
 from track_fusion.rules.shared.elliptical import HEAVY_TAILS, MhdpParams, fuse_projected
 
 
-@dataclasses.dataclass(frozen=True)
-class MhdpExplicitParams(MhdpParams):
-    """The family of the tracks, and what the mean minimises."""
-
-
-def fuse(tracks: SourceTracks, params: MhdpExplicitParams) -> FusedTracks:
+def fuse(tracks: SourceTracks, params: MhdpParams) -> FusedTracks:
     """Fuse K elliptical tracks by MHDP-E: minimal Manhattan distance projections and their log-Euclidean mean.
 
     Takes all tracks to be densities of one elliptical family; promises nothing about their cross-correlation.
@@ -24,7 +17,7 @@ def fuse(tracks: SourceTracks, params: MhdpExplicitParams) -> FusedTracks:
     Parameters
     ----------
     tracks : SourceTracks    mean (..., K, n), cov (..., K, n, n), dof (..., K) or None
-    params : MhdpExplicitParams
+    params : MhdpParams
 
     Returns
     -------
@@ -52,7 +45,7 @@ RULE = Rule(
     key="mhdp_explicit",
     title="MHDP-E: log-Euclidean mean of minimal Manhattan distance projections",
     fuse=fuse,
-    params=MhdpExplicitParams,
+    params=MhdpParams,
     family="elliptical",
     arity="n_ary",
     guarantee="none",

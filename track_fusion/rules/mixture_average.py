@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from track_fusion.densities.mixture.algebra import average
 from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
 from track_fusion.rules.shared.mixtures import AverageParams, fused_tracks
 from track_fusion.rules.shared.weights import GIVEN
 
 
-@dataclasses.dataclass(frozen=True)
-class MixtureAverageParams(AverageParams):
-    """The fusion weights and the number of components."""
-
-
-def fuse(tracks: SourceTracks, params: MixtureAverageParams) -> FusedTracks:
+def fuse(tracks: SourceTracks, params: AverageParams) -> FusedTracks:
     """Fuse K Gaussian mixtures by their arithmetic average: f = sum of w_i f_i.
 
     Conservative if each track is: the weights do not depend on the means. Every mode of every source survives.
@@ -23,7 +16,7 @@ def fuse(tracks: SourceTracks, params: MixtureAverageParams) -> FusedTracks:
     Parameters
     ----------
     tracks : SourceTracks    mixture (..., K, C), or Gaussian tracks; PHDs too: they are not normalised
-    params : MixtureAverageParams
+    params : AverageParams
 
     Returns
     -------
@@ -43,7 +36,7 @@ def fuse(tracks: SourceTracks, params: MixtureAverageParams) -> FusedTracks:
     return fused_tracks(params.reduce(average(params.sources(tracks), weights)), weights)
 
 
-def _reduced(params: MixtureAverageParams) -> bool:
+def _reduced(params: AverageParams) -> bool:
     return bool(params.max_components or params.max_source_components)
 
 
@@ -51,7 +44,7 @@ RULE = Rule(
     key="mixture_average",
     title="Average of mixtures",
     fuse=fuse,
-    params=MixtureAverageParams,
+    params=AverageParams,
     family="mixture",
     arity="n_ary",
     guarantee=lambda params: "none" if params.reduction == "cap" and _reduced(params) else "conservative",

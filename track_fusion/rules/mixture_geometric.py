@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
 from track_fusion.rules.shared.mixtures import AverageParams, fused_tracks, geometric_average
 from track_fusion.rules.shared.weights import GIVEN
 
 
-@dataclasses.dataclass(frozen=True)
-class MixtureGeometricParams(AverageParams):
-    """The fusion weights and the number of components."""
-
-
-def fuse(tracks: SourceTracks, params: MixtureGeometricParams) -> FusedTracks:
+def fuse(tracks: SourceTracks, params: AverageParams) -> FusedTracks:
     """Fuse K Gaussian mixtures by their geometric average, the power of each component by component.
 
     Assumes that the components of one mixture are far apart: cross-products in its power are neglected.
@@ -22,7 +15,7 @@ def fuse(tracks: SourceTracks, params: MixtureGeometricParams) -> FusedTracks:
     Parameters
     ----------
     tracks : SourceTracks    mixture (..., K, C), or Gaussian tracks; each is normalised first
-    params : MixtureGeometricParams
+    params : AverageParams
 
     Returns
     -------
@@ -51,7 +44,7 @@ RULE = Rule(
     key="mixture_geometric",
     title="Geometric average of mixtures",
     fuse=fuse,
-    params=MixtureGeometricParams,
+    params=AverageParams,
     family="mixture",
     arity="n_ary",
     guarantee="none",

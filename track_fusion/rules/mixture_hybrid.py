@@ -2,30 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from track_fusion.rules.base import Example, FusedTracks, Mixture, Rule, SourceTracks
-from track_fusion.rules.shared.mixtures import (
-    AverageParams,
-    fused_tracks,
-    geometric_average,
-    source_mixtures,
-)
+from track_fusion.rules.shared.mixtures import AverageParams, fused_tracks, geometric_average, source_mixtures
 from track_fusion.rules.shared.weights import GIVEN
 
 
-@dataclasses.dataclass(frozen=True)
-class MixtureHybridParams(AverageParams):
-    """The fusion weights and the number of components."""
-
-
-def fuse(tracks: SourceTracks, params: MixtureHybridParams) -> FusedTracks:
+def fuse(tracks: SourceTracks, params: AverageParams) -> FusedTracks:
     """Fuse K un-normalised mixtures (PHDs): arithmetic average of cardinality, geometric of localisation.
 
     Parameters
     ----------
     tracks : SourceTracks    mixture (..., K, C), whose weights sum to the expected number of targets
-    params : MixtureHybridParams
+    params : AverageParams
 
     Returns
     -------
@@ -55,7 +43,7 @@ RULE = Rule(
     key="mixture_hybrid",
     title="Hybrid average of PHDs",
     fuse=fuse,
-    params=MixtureHybridParams,
+    params=AverageParams,
     family="mixture",
     arity="n_ary",
     guarantee="none",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from track_fusion.densities.gaussian import weighted_product
@@ -11,12 +9,7 @@ from track_fusion.params import Params
 from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
 
 
-@dataclasses.dataclass(frozen=True)
-class NaiveParams(Params):
-    """Naive fusion has no parameters."""
-
-
-def fuse(tracks: SourceTracks, params: NaiveParams) -> FusedTracks:
+def fuse(tracks: SourceTracks, params: Params) -> FusedTracks:
     """Fuse K Gaussian tracks by naive fusion: P^-1 = sum of P_i^-1.
 
     Right only for tracks whose errors are independent; common process noise or a common past makes it
@@ -25,7 +18,7 @@ def fuse(tracks: SourceTracks, params: NaiveParams) -> FusedTracks:
     Parameters
     ----------
     tracks : SourceTracks    mean (..., K, n), cov (..., K, n, n)
-    params : NaiveParams
+    params : Params          none
 
     Returns
     -------
@@ -46,7 +39,7 @@ RULE = Rule(
     key="naive",
     title="Naive fusion",
     fuse=fuse,
-    params=NaiveParams,
+    params=Params,
     family="gaussian",
     arity="n_ary",
     guarantee="none",

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.densities.elliptical.rao import manhattan_paths
-from track_fusion.linalg import Array, inverse, matvec, symmetrise, transpose
+from track_fusion.linalg import Array, cholesky, inverse, matvec, symmetrise, transpose, whitener
 from track_fusion.rules.base import Example, FusedTracks, Rule, SourceTracks
 from track_fusion.rules.shared.elliptical import HEAVY_TAILS, EllipticalParams, each, family_of
 from track_fusion.rules.shared.weights import pooled_by
@@ -23,12 +23,7 @@ TIE = 1e-9
 CHUNK_NUMBERS = 2**16
 
 
-@dataclasses.dataclass(frozen=True)
-class QuasiMinimalManhattanParams(EllipticalParams):
-    """The family of the tracks."""
-
-
-def fuse(tracks: SourceTracks, params: QuasiMinimalManhattanParams) -> FusedTracks:
+def fuse(tracks: SourceTracks, params: EllipticalParams) -> FusedTracks:
     """Fuse K elliptical tracks by the intersection whose minimal Manhattan distances to them are least.
 
     The weights minimise the sum of the squares of the distances (28) from each track to the fused one. Promises
@@ -37,7 +32,7 @@ def fuse(tracks: SourceTracks, params: QuasiMinimalManhattanParams) -> FusedTrac
     Parameters
     ----------
     tracks : SourceTracks    mean (..., K, n), cov (..., K, n, n), dof (..., K) or None
-    params : QuasiMinimalManhattanParams
+    params : EllipticalParams
 
     Returns
     -------
@@ -107,10 +102,10 @@ class _Distances:
 
     @classmethod
     def of(cls, mean: Array, cov: Array, pull: Array, radius: Array, weight: Array) -> _Distances:
-        whiten = _back(_root(cov.sum(1)))[:, None]
+        whiten = whitener(cov.sum(1))[:, None]
         white = symmetrise(whiten @ cov @ transpose(whiten))
         points = matvec(whiten, mean - mean[:, :1])
-        return cls(points, inverse(white), _root(white), pull, radius, weight)
+        return cls(points, inverse(white), cholesky(white), pull, radius, weight)
 
     def __call__(self, w: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
         points, info, root = self.points[rows], self.info[rows], self.root[rows]
@@ -139,24 +134,16 @@ class _Distances:
 
 def _log_ratios(root: Array, fused: Array) -> tuple[Array, Array]:
     """Logarithms of the eigenvalues of P_k^-1 P, (B, K, n), and C_k V, V their vectors in the axes of C_k = root."""
-    back = _back(root)
+    back: Array = np.asarray(np.linalg.inv(root), np.float64)
     values, vectors = np.linalg.eigh(symmetrise(back @ fused[:, None] @ transpose(back)))
     return np.log(np.maximum(values, np.finfo(float).tiny)), root @ vectors
-
-
-def _root(cov: Array) -> Array:
-    return np.asarray(np.linalg.cholesky(cov), np.float64)
-
-
-def _back(root: Array) -> Array:
-    return np.asarray(np.linalg.inv(root), np.float64)
 
 
 RULE = Rule(
     key="quasi_minimal_manhattan",
     title="Quasi-minimal Manhattan distance",
     fuse=fuse,
-    params=QuasiMinimalManhattanParams,
+    params=EllipticalParams,
     family="elliptical",
     arity="n_ary",
     guarantee="none",

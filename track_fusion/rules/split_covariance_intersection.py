@@ -19,12 +19,7 @@ ROUNDING = 1e-9
 SMALLEST = 1e-14
 
 
-@dataclasses.dataclass(frozen=True)
-class SplitCovarianceIntersectionParams(CovarianceIntersectionParams):
-    """How the fusion weights omega are chosen."""
-
-
-def fuse(tracks: SourceTracks, params: SplitCovarianceIntersectionParams) -> FusedTracks:
+def fuse(tracks: SourceTracks, params: CovarianceIntersectionParams) -> FusedTracks:
     """Fuse K Gaussian tracks by split covariance intersection: P^-1 = sum of (D_i / w_i + I_i)^-1.
 
     P_i = D_i + I_i, where the errors of covariance I_i are independent of all others and nothing is known of the
@@ -34,7 +29,7 @@ def fuse(tracks: SourceTracks, params: SplitCovarianceIntersectionParams) -> Fus
     ----------
     tracks : SourceTracks    mean (..., K, n), cov (..., K, n, n); extras independent_cov (..., K, n, n), I_i, positive
                              semi-definite and not above cov
-    params : SplitCovarianceIntersectionParams
+    params : CovarianceIntersectionParams
 
     Returns
     -------
@@ -174,7 +169,7 @@ RULE = Rule(
     key="split_covariance_intersection",
     title="Split covariance intersection",
     fuse=fuse,
-    params=SplitCovarianceIntersectionParams,
+    params=CovarianceIntersectionParams,
     family="gaussian",
     arity="n_ary",
     guarantee="conservative",

@@ -9,11 +9,7 @@ from track_fusion.scenarios.chen2022 import dynamic_1, dynamic_2, static
 from track_fusion.scenarios.li2019 import densities, mixture, six_sensors, variables
 from track_fusion.scenarios.li2022 import four_cases, linear, nonlinear, target_fit
 from track_fusion.scenarios.sharma import gaussians, mixtures, network_1, network_2, radars, scalar
-from track_fusion.study.judgement import judged_claims, judged_figures
-from track_fusion.study.rows import Outcomes
-from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.study.scenario import Scenario
-from track_fusion.study.scene import Scene, Tracking
 
 _MODULES = (
     *(linear, nonlinear, four_cases, target_fit),
@@ -46,17 +42,3 @@ def find_scenario(name: str) -> Scenario:
     ParameterError    there is none
     """
     return from_file(name, "SCENARIO", Scenario) if is_path(name) else get_scenario(name)
-
-
-__all__ = [
-    "SCENARIOS",
-    "Outcomes",
-    "RuleChoice",
-    "Scenario",
-    "Scene",
-    "Tracking",
-    "find_scenario",
-    "get_scenario",
-    "judged_claims",
-    "judged_figures",
-]

@@ -19,10 +19,6 @@ from track_fusion.linalg import Array
 from track_fusion.models.base import Transition
 from track_fusion.random_streams import stream
 from track_fusion.rules import FusedTracks
-from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
-from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
-from track_fusion.rules.covariance_union import CovarianceUnionParams
-from track_fusion.rules.naive import NaiveParams
 from track_fusion.study.rule_choice import RuleChoice, fuse_runs
 from track_fusion.study.scene import Tracking
 from track_fusion.trackers.fusion_loop import BatchTracker, filtered, fusion_loop
@@ -36,13 +32,13 @@ COVARIANCE_FLOOR = 1e-9
 #: The rules of section IV. Covariance union is a bound of all P_i + (x - x_i)(x - x_i)' about the arithmetic average,
 #: about the mean at which that bound is least, or, as eq. (8) is printed, the one of them with the largest trace.
 RULE_CHOICES = (
-    RuleChoice("naive", NaiveParams()),
-    RuleChoice("arithmetic_average", ArithmeticAverageParams(criterion="diversity")),
-    RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="trace")),
-    RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="uniform"), "uniform"),
-    RuleChoice("covariance_union", CovarianceUnionParams(criterion="det", mean="diversity")),
-    RuleChoice("covariance_union", CovarianceUnionParams(criterion="det", mean="optimal"), "optimal_mean"),
-    RuleChoice("covariance_union", CovarianceUnionParams(bound="max_trace", mean="diversity"), "max_trace"),
+    RuleChoice.of("naive"),
+    RuleChoice.of("arithmetic_average", criterion="diversity"),
+    RuleChoice.of("covariance_intersection", criterion="trace"),
+    RuleChoice.of("covariance_intersection", "uniform", criterion="uniform"),
+    RuleChoice.of("covariance_union", criterion="det", mean="diversity"),
+    RuleChoice.of("covariance_union", "optimal_mean", criterion="det", mean="optimal"),
+    RuleChoice.of("covariance_union", "max_trace", bound="max_trace", mean="diversity"),
 )
 
 

@@ -16,6 +16,8 @@ T = TypeVar("T")
 Outcomes = dict[str, Array]
 #: Is told which share is done.
 Progress = Callable[[float], None]
+#: A row in which nothing is random: () -> {quantity: value}.
+Exact = Callable[[], Mapping[str, Any]]
 
 
 def chosen(rows: Mapping[str, T], only: str) -> dict[str, T]:
@@ -51,15 +53,11 @@ def run_by_run(runs: Sequence[int], progress: Progress, one: Callable[[int, Prog
 
 
 def exact_rows(
-    rows: Mapping[str, Callable[[], Mapping[str, Any]]],
-    runs: Sequence[int],
-    seed: int,
-    progress: Progress,
-    only: str = "",
+    rows: Mapping[str, Exact], runs: Sequence[int], seed: int, progress: Progress, only: str = ""
 ) -> Outcomes:
     """Work out the rows whose names start with `only`, in which nothing is random: every run has the same numbers."""
 
-    def repeated(work_out: Callable[[], Mapping[str, Any]]) -> Outcomes:
+    def repeated(work_out: Exact) -> Outcomes:
         return {quantity: np.array([value] * len(runs)) for quantity, value in work_out().items()}
 
     return row_by_row(chosen(rows, only), progress, repeated)

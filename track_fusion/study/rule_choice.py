@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
+from track_fusion.angles import wraps
 from track_fusion.linalg import Array, matvec, transpose
-from track_fusion.params import ParameterError, Params
+from track_fusion.params import ParameterError, Params, from_dict
 from track_fusion.rules import RULES, FusedTracks, Rule, SourceTracks
 from track_fusion.study.rows import Outcomes, Progress, row_by_row
 
@@ -21,6 +23,16 @@ class RuleChoice:
     key: str
     params: Params
     variant: str = ""
+
+    @classmethod
+    def of(cls, key: str, variant: str = "", /, **values: Any) -> RuleChoice:
+        """Choose a rule by its key; parameters that are not given have their defaults.
+
+        Raises
+        ------
+        ParameterError    no such rule or parameter
+        """
+        return cls(key, from_dict(RULES[key].params, values), variant)
 
     @property
     def name(self) -> str:
@@ -67,7 +79,7 @@ def fuse_runs(
     Notes    A linear rule gives sum of A_i x_i; fusing unit vectors gives its matrices A_i.
     """
     runs, count, n = mean.shape
-    if len(cov) < runs and choice.rule.linear and not np.isfinite(periods).any():
+    if len(cov) < runs and choice.rule.linear and not wraps(periods):
         units = np.eye(count * n).reshape(-1, count, n)
         fused = choice.fuse(SourceTracks(units, np.repeat(cov, len(units), 0)))
         weights = None if fused.weights is None else fused.weights[:1]

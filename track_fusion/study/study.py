@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from track_fusion.params import ParameterError, from_dict
+from track_fusion.params import ParameterError
 from track_fusion.plugins import is_path
 from track_fusion.rules import find_rule
 from track_fusion.study.rows import Outcomes
@@ -90,7 +90,7 @@ def choice(scenario: Scenario, spec: RuleSpec) -> RuleChoice:
         return ours[name]
     if spec.variant and not spec.params:
         raise ParameterError(f"The scenario '{scenario.key}' has no '{name}'. It has: {', '.join(sorted(ours))}.")
-    return RuleChoice(rule.key, from_dict(rule.params, dict(spec.params)), spec.variant)
+    return RuleChoice.of(rule.key, spec.variant, **dict(spec.params))
 
 
 def _silent(share: float) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, triu
 
-from track_fusion.angles import difference, wrap
+from track_fusion.angles import TURN, difference, wrap
 from track_fusion.association.boxes import points_in_boxes
 from track_fusion.filters.base import Gaussian
 from track_fusion.filters.extended import Extended
@@ -157,9 +157,9 @@ class PdaTracker:
         slope = self.sensor.jacobian(mean)
         variance = ((slope @ cov) * slope).sum(-1) + np.diagonal(self.sensor.noise)
         reach = np.sqrt(self._gamma * variance) * (1.0 + ROUNDING)
-        reach[:, 1] = np.minimum(reach[:, 1], np.pi)
+        reach[:, 1] = np.minimum(reach[:, 1], 0.5 * TURN)
         expected = self.sensor.observe(mean)
-        return points_in_boxes(values, expected - reach, expected + reach, 2.0 * np.pi)
+        return points_in_boxes(values, expected - reach, expected + reach, TURN)
 
     def _doubled(self, tracks: PdaTracks, row: Indices, col: Indices) -> Indices:
         """Tracks that have come to be another; of two the confirmed one stays, else the older.

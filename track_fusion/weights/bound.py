@@ -17,16 +17,8 @@ FLAT = 1e-6
 def bound_weights(mean: Array, cov: Array) -> Solution:
     """Minimise the sum of w_i log(|P_i|^1/2 sum of w_j z_ij), z_ij the integral of p_i p_j, over the simplex.
 
-    Parameters
-    ----------
-    mean : (B, K, n)
-    cov : (B, K, n, n)
-
-    Returns
-    -------
-    Solution    weights (B, K), the best that is found from the centre and from near every corner; iterations of that
-
-    Notes         From four axes on the objective may have several minima.
+    Notes         From four axes on the objective may have several minima: the best that is found from the centre and
+                  from near every corner, and the iterations of that.
     """
     batch, count = mean.shape[:2]
     overlap = _overlap(mean, cov)

@@ -30,13 +30,12 @@ def merging_weights(mean: Array, cov: Array, linear: Array | None = None) -> Sol
 
     Parameters
     ----------
-    mean : (B, K, n)
-    cov : (B, K, n, n)
+    mean, cov
     linear : (B, K) or None    l; None = log det P_i
 
     Returns
     -------
-    Solution    weights (B, K); uniform where all tracks are equal
+    Solution    uniform where all tracks are equal
     """
     if mean.shape[1] == 1:
         return Solution.known(np.ones(mean.shape[:2]))
@@ -123,10 +122,7 @@ def _gradient_hessian(mean: Array, cov: Array, linear: Array | None) -> Gradient
     slopes = logdet(white) if linear is None else linear
 
     def gradient_hessian(w: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
-        x = points[rows]
-        centred = x - np.einsum("bk,bki->bi", w, x)[:, None]
-        spread = white[rows] + centred[..., :, None] * centred[..., None, :]
-        info = np.linalg.inv(np.einsum("bk,bkij->bij", w, spread))[:, None]
+        centred, spread, info = _about_mean(w, points[rows], white[rows])
         # On the simplex the derivative of P_AA along w_i is P_i + (x_i - x)(x_i - x)', up to a common term.
         step = info @ spread
         gradient = slopes[rows] - np.trace(step, axis1=-2, axis2=-1)
@@ -137,17 +133,15 @@ def _gradient_hessian(mean: Array, cov: Array, linear: Array | None) -> Gradient
     return gradient_hessian
 
 
+def _about_mean(w: Array, x: Array, white: Array) -> tuple[Array, Array, Array]:
+    """X_i - x (b, K, n), P_i + (x_i - x)(x_i - x)' (b, K, n, n), and P_AA^-1 (b, 1, n, n), x the mean at weights w."""
+    centred = x - np.einsum("bk,bki->bi", w, x)[:, None]
+    spread = white + centred[..., :, None] * centred[..., None, :]
+    return centred, spread, np.linalg.inv(np.einsum("bk,bkij->bij", w, spread))[:, None]
+
+
 def merging_weights_by_trace(mean: Array, cov: Array) -> Solution:
     """Minimise the trace of the inverse of P_AA(w), of a flat batch: (77) of Sharma by the trace, for K tracks.
-
-    Parameters
-    ----------
-    mean : (B, K, n)
-    cov : (B, K, n, n)
-
-    Returns
-    -------
-    Solution    weights (B, K)
 
     Notes         P_AA is concave in the weights, and the trace of an inverse convex and falling: a convex program.
     """
@@ -157,10 +151,7 @@ def merging_weights_by_trace(mean: Array, cov: Array) -> Solution:
     white, points = cov / (scale[:, None, :, None] * scale[:, None, None, :]), mean / scale[:, None]
 
     def gradient_hessian(w: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
-        x = points[rows]
-        centred = x - np.einsum("bk,bki->bi", w, x)[:, None]
-        spread = white[rows] + centred[..., :, None] * centred[..., None, :]
-        info = np.linalg.inv(np.einsum("bk,bkij->bij", w, spread))[:, None]
+        centred, spread, info = _about_mean(w, points[rows], white[rows])
         weigh = info @ (unit[rows, None, :, None] * info)  # M^-1 U M^-1
         gradient = -(weigh * spread).sum((-2, -1))
         step = (info @ spread).reshape(len(w), count, n * n)

@@ -35,16 +35,7 @@ def _pooling_weights(mean: Array, cov: Array, naive: bool) -> Solution:
     """Minimise c(w) - sum of w_i E[log p_i], c the logarithm of the integral of the product of p_i^w_i.
 
     The expectation is over the naive product, or left out. c is convex: its gradient is the expectation of
-    log p_i over the average, and its Hessian their covariance.
-
-    Parameters
-    ----------
-    mean : (B, K, n)
-    cov : (B, K, n, n)
-
-    Returns
-    -------
-    Solution    weights (B, K); uniform where all tracks are equal
+    log p_i over the average, and its Hessian their covariance. Uniform where all tracks are equal.
     """
     batch, count = mean.shape[:2]
     if count == 1:

@@ -24,13 +24,8 @@ def target_weights(mean: Array, cov: Array, target: Mixture) -> Solution:
 
     Parameters
     ----------
-    mean : (B, K, n)
-    cov : (B, K, n, n)
+    mean, cov
     target : Mixture    (B, T), normalised
-
-    Returns
-    -------
-    Solution    weights (B, K)
 
     Notes         With q the mean of the K densities the divergence is the expectation over q of
                   (f / q) log(f / p) - f / q + p / q, convex in the weights of f at each point, so that it is so on any

@@ -10,8 +10,8 @@ from track_fusion.densities.mixture.mixture import Mixture
 from track_fusion.filters.gaussian_sum_modes import MixtureModes
 from track_fusion.params import ParameterError
 from track_fusion.rules import RULES
-from track_fusion.scenarios import judged_claims
 from track_fusion.scenarios.ahmed import maneuver, platforms
+from track_fusion.study.judgement import judged_claims
 from track_fusion.study.rule_choice import RuleChoice
 
 STEPS = 125

@@ -14,10 +14,10 @@ from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.params import ParameterError, from_dict
 from track_fusion.rules import RULES
-from track_fusion.scenarios import judged_claims
 from track_fusion.scenarios.ahmed import proposals as ahmed_proposals
 from track_fusion.scenarios.ahmed import random as ahmed_random
 from track_fusion.scenarios.ahmed.mixtures import CELL_AREA, GRID, Problem, log_fused, random_mixture
+from track_fusion.study.judgement import judged_claims
 from track_fusion.study.rows import Outcomes
 from track_fusion.study.rule_choice import RuleChoice
 

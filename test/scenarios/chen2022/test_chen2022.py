@@ -15,20 +15,21 @@ from track_fusion.models.noise import Noise
 from track_fusion.params import ParameterError
 from track_fusion.random_streams import stream
 from track_fusion.rules import RULES, SourceTracks
-from track_fusion.rules.split_covariance_intersection import SplitCovarianceIntersectionParams
-from track_fusion.scenarios import SCENARIOS, RuleChoice, judged_claims
+from track_fusion.scenarios import SCENARIOS
 from track_fusion.scenarios.chen2022 import dynamic, static
 from track_fusion.scenarios.chen2022 import dynamic_1 as case_1
 from track_fusion.scenarios.chen2022 import dynamic_2 as case_2
 from track_fusion.scenarios.chen2022.dynamic import DCI, FCI, GP, KLA, MHDP_E, MHDP_I, QMMHD
+from track_fusion.study.judgement import judged_claims
 from track_fusion.study.rows import Outcomes
+from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.study.scene import Tracking
 
 CASES = {"I": case_1.TRACKING, "II": case_2.TRACKING}
 #: The first steps, for comparisons of mechanics.
 SHORT = {case: dataclasses.replace(tracking, steps=8) for case, tracking in CASES.items()}
 #: A rule that needs more than the tracks.
-SPLIT = RuleChoice("split_covariance_intersection", SplitCovarianceIntersectionParams())
+SPLIT = RuleChoice.of("split_covariance_intersection")
 
 
 def silent(share: float) -> None:
@@ -98,9 +99,7 @@ def test_static_comparison_takes_any_rule_that_needs_only_tracks() -> None:
     assert all(values.shape == (3,) and (values >= 0).all() for values in found.values())
     np.testing.assert_allclose(found["given-mhdp_explicit/rao_distance_gg065_1"], 0.0236, atol=1e-4)
     with pytest.raises(ParameterError, match="split_covariance_intersection"):
-        static.SCENARIO.compare(
-            [RuleChoice("split_covariance_intersection", SplitCovarianceIntersectionParams())], [0], 0, silent
-        )
+        static.SCENARIO.compare([RuleChoice.of("split_covariance_intersection")], [0], 0, silent)
 
 
 # ---- 5.2: draws -----------------------------------------------------------------------------------------------------

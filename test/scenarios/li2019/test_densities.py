@@ -9,9 +9,9 @@ from scipy.stats import norm
 
 from track_fusion.params import ParameterError
 from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
-from track_fusion.rules.split_covariance_intersection import SplitCovarianceIntersectionParams
-from track_fusion.scenarios import RuleChoice, judged_claims, judged_figures
 from track_fusion.scenarios.li2019.densities import AA, GA, PAIRS, SCENARIO, THETA, WEIGHT
+from track_fusion.study.judgement import judged_claims, judged_figures
+from track_fusion.study.rule_choice import RuleChoice
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def test_rules_are_compared_by_their_error():
     )
     square = ((points[:, None] - THETA) ** 2).mean()
     assert found["given-arithmetic_average/fig5_rms_error_1"][0] == pytest.approx(np.sqrt(square), rel=1e-3)
-    needy = RuleChoice("split_covariance_intersection", SplitCovarianceIntersectionParams())
+    needy = RuleChoice.of("split_covariance_intersection")
     with pytest.raises(ParameterError, match="which needs '.*' beside the tracks"):
         SCENARIO.compare([needy], [0], 0, lambda share: None)
 

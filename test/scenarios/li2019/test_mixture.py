@@ -7,10 +7,10 @@ import pytest
 from scipy.integrate import trapezoid
 from scipy.stats import norm
 
-from track_fusion.rules.geometric_average import GeometricAverageParams
-from track_fusion.scenarios import RuleChoice, judged_claims
 from track_fusion.scenarios.li2019.common import exact_geometric, intensity
 from track_fusion.scenarios.li2019.mixture import AA, EXACT, GA, PARTS, SCENARIO, X, fused_mixture
+from track_fusion.study.judgement import judged_claims
+from track_fusion.study.rule_choice import RuleChoice
 
 #: Weight, mean and variance of the hybrid average's components.
 ERRATA = [
@@ -76,7 +76,7 @@ def test_claims_of_the_paper_that_do_not_hold(measured):
 
 def test_averages_have_the_least_divergences():
     """The arithmetic average of densities is nearest seen from the sources, at equal weights among all densities."""
-    pooled = RuleChoice("geometric_average", GeometricAverageParams())
+    pooled = RuleChoice.of("geometric_average")
     found = SCENARIO.compare([*SCENARIO.rules, pooled], range(2), 0, lambda share: None)
     assert all(values.shape == (2,) for values in found.values())
     of_sources = {name: v[0] for name, v in found.items() if "of_sources" in name}

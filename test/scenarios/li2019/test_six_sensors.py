@@ -8,10 +8,6 @@ from scipy.stats import norm
 
 from track_fusion.params import ParameterError
 from track_fusion.random_streams import stream
-from track_fusion.rules.mixture_hybrid import MixtureHybridParams
-from track_fusion.rules.naive import NaiveParams
-from track_fusion.rules.split_covariance_intersection import SplitCovarianceIntersectionParams
-from track_fusion.scenarios import RuleChoice, judged_claims
 from track_fusion.scenarios.li2019.common import exact_geometric, intensity, scalar_mixture
 from track_fusion.scenarios.li2019.six_sensors import (
     AA,
@@ -28,6 +24,8 @@ from track_fusion.scenarios.li2019.six_sensors import (
     scan,
     trials,
 )
+from track_fusion.study.judgement import judged_claims
+from track_fusion.study.rule_choice import RuleChoice
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +117,7 @@ def test_masses_of_the_arithmetic_average_component_by_component(some):
 def test_masses_of_the_geometric_averages_point_by_point(some):
     """The product over sensors of sums of sixth roots of components, (49), and the sixth root of the product."""
     parts, _ = some
-    rule = by_rule(RuleChoice("mixture_hybrid", MixtureHybridParams(max_components=20)))(parts)
+    rule = by_rule(RuleChoice.of("mixture_hybrid", max_components=20))(parts)
     exact = exact_geometric(parts, X)
     for run in range(8):
         approximate, product, number = np.ones(len(X)), np.ones(len(X)), 0.0
@@ -178,13 +176,13 @@ def test_pieces_equal_the_whole(outcomes):
 
 
 def test_any_rules_are_compared(outcomes):
-    rules = [*SCENARIO.rules, RuleChoice("naive", NaiveParams())]
+    rules = [*SCENARIO.rules, RuleChoice.of("naive")]
     found = SCENARIO.compare(rules, range(4), 1, lambda share: None)
     for row in (AA, GA):
         np.testing.assert_array_equal(found[f"{row}/lost_targets_1"], outcomes[f"{row}/lost"][:4].sum(-1))
         np.testing.assert_allclose(found[f"{row}/far_mass_1"], outcomes[f"{row}/far"][:4], rtol=1e-9)
     assert (found["given-naive/lost_targets_1"] >= 3).all()  # one Gaussian cannot cover them all
-    needy = RuleChoice("split_covariance_intersection", SplitCovarianceIntersectionParams())
+    needy = RuleChoice.of("split_covariance_intersection")
     with pytest.raises(ParameterError, match="which needs '.*' beside the tracks"):
         SCENARIO.compare([needy], [0], 1, lambda share: None)
 

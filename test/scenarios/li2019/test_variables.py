@@ -8,7 +8,6 @@ from scenarios.li2019.quadrature import positive_normal_pair
 from scipy.stats import kstest, multivariate_normal, norm, poisson
 
 from track_fusion.params import ParameterError
-from track_fusion.scenarios import judged_claims
 from track_fusion.scenarios.li2019.averages import average_moments
 from track_fusion.scenarios.li2019.variable_pairs import RATES, copula_correlation, normal_pair, poisson_pair
 from track_fusion.scenarios.li2019.variables import (
@@ -23,6 +22,7 @@ from track_fusion.scenarios.li2019.variables import (
     lowest,
     variance_curve,
 )
+from track_fusion.study.judgement import judged_claims
 
 RUNS = 150
 

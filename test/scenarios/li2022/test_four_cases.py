@@ -9,7 +9,6 @@ from track_fusion.densities.mixture.mixture import Mixture
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.params import ParameterError
 from track_fusion.rules import RULES
-from track_fusion.scenarios import RuleChoice, judged_claims, judged_figures
 from track_fusion.scenarios.li2022.four_cases import (
     COVS,
     ROWS,
@@ -19,6 +18,8 @@ from track_fusion.scenarios.li2022.four_cases import (
     modes,
     two_tracks,
 )
+from track_fusion.study.judgement import judged_claims, judged_figures
+from track_fusion.study.rule_choice import RuleChoice
 
 RUNS = 3
 

@@ -10,9 +10,10 @@ from scipy.linalg import solve_discrete_are
 
 from track_fusion.params import ParameterError
 from track_fusion.rules import RULES, SourceTracks
-from track_fusion.scenarios import RuleChoice, judged_claims, judged_figures
-from track_fusion.scenarios.li2022.linear import RULE_CHOICES, SCENARIO, STUDY, TRACKING, kalman_rows
+from track_fusion.scenarios.li2022.linear import KALMAN_ROWS, RULE_CHOICES, SCENARIO, STUDY, TRACKING
+from track_fusion.study.judgement import judged_claims, judged_figures
 from track_fusion.study.one_target_study import TRUTH
+from track_fusion.study.rule_choice import RuleChoice
 
 RUNS = 1000
 #: Converged values (position m, velocity m/s) and the spread of one 100-run table, by an independent implementation.
@@ -31,7 +32,7 @@ REFERENCE_RUNS, ROUNDING = 1000, 0.005
 
 
 #: Rows by Kalman filters, that without a closed form aside; the particle filters' rows: test_filter_scenarios.
-KALMAN = {name: row for name, row in kalman_rows().items() if not name.endswith("@optimal_mean")}
+KALMAN = {name: row for name, row in KALMAN_ROWS.items() if not name.endswith("@optimal_mean")}
 
 
 def sampled(rows, runs, seed, progress=lambda share: None):
@@ -45,7 +46,7 @@ def measured():
 
 @pytest.fixture(scope="module")
 def unions():
-    return STUDY.figures(sampled(kalman_rows(), range(UNION_RUNS), 21))
+    return STUDY.figures(sampled(KALMAN_ROWS, range(UNION_RUNS), 21))
 
 
 @pytest.mark.parametrize("row", ERRATA)
@@ -104,7 +105,7 @@ def test_filters_claim_what_the_riccati_equation_says():
     predicted = solve_discrete_are(transition.T, one.matrix.T, noise, one.noise)
     gain = predicted @ one.matrix.T @ np.linalg.inv(one.matrix @ predicted @ one.matrix.T + one.noise)
     wanted = np.trace((predicted - gain @ one.matrix @ predicted)[:2, :2])
-    found = sampled({"kf-alone": kalman_rows()["kf-alone"]}, range(2), 0)["kf-alone/claimed_position_m2"]
+    found = sampled({"kf-alone": KALMAN_ROWS["kf-alone"]}, range(2), 0)["kf-alone/claimed_position_m2"]
     np.testing.assert_allclose(found[:, -1], wanted, rtol=1e-9)
 
 
@@ -147,7 +148,7 @@ def test_the_study_equals_filters_and_rule_looped_over_one_run(choice):
     truth = TRACKING.truth(seed, run)
     drawn = TRACKING.measurements(truth, seed, run)
     name = f"kf-{choice.name}"
-    found = sampled({name: kalman_rows()[name]}, [7, run], seed)
+    found = sampled({name: KALMAN_ROWS[name]}, [7, run], seed)
     np.testing.assert_array_equal(found[TRUTH][1], truth[:, :2])
     mean, cov = TRACKING.initial_mean, TRACKING.initial_cov
     transition, noise = TRACKING.motion.matrices(TRACKING.dt_s)

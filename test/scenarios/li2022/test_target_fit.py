@@ -8,8 +8,6 @@ from scipy.stats import norm
 
 from track_fusion.params import ParameterError
 from track_fusion.rules import RULES
-from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
-from track_fusion.scenarios import RuleChoice, judged_claims, judged_figures
 from track_fusion.scenarios.li2022.target_fit import (
     BEST,
     DENSITIES,
@@ -24,6 +22,8 @@ from track_fusion.scenarios.li2022.target_fit import (
     fitted,
     mixture,
 )
+from track_fusion.study.judgement import judged_claims, judged_figures
+from track_fusion.study.rule_choice import RuleChoice
 
 MEANS, VARIANCES = DENSITIES.T
 
@@ -166,6 +166,6 @@ def test_the_geometric_average_is_the_target_of_case_1():
 
 
 def test_a_rule_may_use_the_target():
-    choice = RuleChoice("arithmetic_average", ArithmeticAverageParams(criterion="target"), "target")
+    choice = RuleChoice.of("arithmetic_average", "target", criterion="target")
     found = SCENARIO.compare([choice], [0], 0, lambda share: None)
     assert found["given-arithmetic_average@target/kld_case_1_nats"] < 1e-9

@@ -5,10 +5,9 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from track_fusion.params import ParameterError
-from track_fusion.rules.mixture_exact import MixtureExactParams
-from track_fusion.scenarios import judged_claims
 from track_fusion.scenarios.sharma import gaussians as sharma_gaussians
 from track_fusion.scenarios.sharma import mixtures as sharma_mixtures
+from track_fusion.study.judgement import judged_claims
 from track_fusion.study.rule_choice import RuleChoice
 
 RUNS = 40
@@ -17,12 +16,12 @@ MODULES = {"gaussians": sharma_gaussians, "mixtures": sharma_mixtures}
 
 @pytest.fixture(scope="module")
 def outcomes():
-    return {key: module.simulate(range(RUNS), 3, lambda share: None) for key, module in MODULES.items()}
+    return {key: module.SCENARIO.simulate(range(RUNS), 3, lambda share: None) for key, module in MODULES.items()}
 
 
 @pytest.fixture(scope="module")
 def measured(outcomes):
-    return {key: module.figures(outcomes[key]) for key, module in MODULES.items()}
+    return {key: module.SCENARIO.figures(outcomes[key]) for key, module in MODULES.items()}
 
 
 @pytest.mark.parametrize(
@@ -104,12 +103,14 @@ def test_claims_of_the_mixtures(measured):
 @pytest.mark.parametrize("key", MODULES)
 def test_pieces_equal_the_whole_and_only_chooses_rows(outcomes, key):
     only = "given-harmonic_mean@sampled"
-    part = MODULES[key].simulate([5, 7], 3, lambda share: None, only)
+    part = MODULES[key].SCENARIO.simulate([5, 7], 3, lambda share: None, only)
     assert all(name.startswith(only) for name in part)
     for name, values in part.items():
         np.testing.assert_allclose(values, outcomes[key][name][[5, 7]], rtol=1e-9, err_msg=name)
-    assert set(MODULES[key].figures(part)) == {n for n in MODULES[key].figures(outcomes[key]) if n.startswith(only)}
-    assert MODULES[key].charts(part)
+    assert set(MODULES[key].SCENARIO.figures(part)) == {
+        n for n in MODULES[key].SCENARIO.figures(outcomes[key]) if n.startswith(only)
+    }
+    assert MODULES[key].SCENARIO.charts(part)
 
 
 def test_charts_of_the_gaussians_are_ellipses_of_two_sigma(outcomes):
@@ -122,7 +123,7 @@ def test_charts_of_the_gaussians_are_ellipses_of_two_sigma(outcomes):
 
 
 def test_charts_of_the_mixtures_show_exact_and_sampled_densities(outcomes):
-    _, *means = sharma_mixtures.charts(outcomes["mixtures"])
+    _, *means = sharma_mixtures.SCENARIO.charts(outcomes["mixtures"])
     assert len(means) == 2
     for exact, drawn in (chart.contours for chart in means):
         assert exact.z.shape == (len(exact.y), len(exact.x))
@@ -136,4 +137,4 @@ def test_compare_gives_a_divergence_a_run(key):
     assert set(found) == {f"given-{c.name}/kld_nats" for c in choices}
     assert all(v.shape == (2,) and (v > 0).all() for v in found.values())
     with pytest.raises(ParameterError, match="Got 'mixture_exact', which needs 'common' beside"):
-        scenario.compare([RuleChoice("mixture_exact", MixtureExactParams())], [0], 0, lambda share: None)
+        scenario.compare([RuleChoice.of("mixture_exact")], [0], 0, lambda share: None)

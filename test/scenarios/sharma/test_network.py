@@ -9,12 +9,10 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from track_fusion.params import ParameterError
-from track_fusion.rules.harmonic_mean import HarmonicMeanParams
-from track_fusion.rules.mixture_exact import MixtureExactParams
-from track_fusion.scenarios import judged_claims
 from track_fusion.scenarios.sharma import network_1 as sharma_network_1
 from track_fusion.scenarios.sharma import network_2 as sharma_network_2
 from track_fusion.scenarios.sharma.network import RULE_CHOICES, figures
+from track_fusion.study.judgement import judged_claims
 from track_fusion.study.rule_choice import RuleChoice
 
 RUNS = 20_000
@@ -37,7 +35,7 @@ CASES = [(key, row, *values) for key, rows in ERRATA.items() for row, values in 
 
 @pytest.fixture(scope="module")
 def outcomes():
-    return {key: module.simulate(range(RUNS), 5, lambda share: None) for key, module in MODULES.items()}
+    return {key: module.SCENARIO.simulate(range(RUNS), 5, lambda share: None) for key, module in MODULES.items()}
 
 
 @pytest.fixture(scope="module")
@@ -168,22 +166,22 @@ def test_every_estimate_is_consistent_before_anything_is_sent():
 @pytest.mark.parametrize("key", MODULES)
 def test_pieces_equal_the_whole_and_only_chooses_rows(outcomes, key):
     for only in ("kf-harmonic", "kf-ellipsoidal_intersection", "kf-centralised"):
-        part = MODULES[key].simulate([3, 1500], 5, lambda share: None, only)
+        part = MODULES[key].SCENARIO.simulate([3, 1500], 5, lambda share: None, only)
         assert part
         for name, values in part.items():
             assert name.startswith(only)
             np.testing.assert_allclose(values, outcomes[key][name][[3, 1500]], rtol=1e-9, atol=1e-12, err_msg=name)
         assert all(name.startswith(only) for name in figures(part))
-        assert MODULES[key].charts(part)
+        assert MODULES[key].SCENARIO.charts(part)
 
 
 @pytest.mark.parametrize("key", MODULES)
 def test_charts_of_a_single_run(key):
-    assert MODULES[key].charts(MODULES[key].simulate([0], 1, lambda share: None))
+    assert MODULES[key].SCENARIO.charts(MODULES[key].SCENARIO.simulate([0], 1, lambda share: None))
 
 
 def test_charts_are_two_sigma_ellipses(outcomes):
-    pictures = sharma_network_1.charts(outcomes["1"])
+    pictures = sharma_network_1.SCENARIO.charts(outcomes["1"])
     assert [len(c.series) for c in pictures] == [6, 6, 6, 6, 2]
     reported, errors = pictures[0].series[:2]
     cov = outcomes["1"]["kf-centralised/cov"][0]
@@ -200,12 +198,12 @@ def test_compare_takes_any_rule_and_refuses_what_needs_more(outcomes, key):
     np.testing.assert_allclose(found["kf-harmonic_mean/error_1"], wanted, rtol=1e-9)
     assert found["kf-ellipsoidal_intersection/error_1"].shape == (20,)
     with pytest.raises(ParameterError, match="Got 'mixture_exact', which needs 'common' beside"):
-        scenario.compare([RuleChoice("mixture_exact", MixtureExactParams())], [0], 0, lambda share: None)
+        scenario.compare([RuleChoice.of("mixture_exact")], [0], 0, lambda share: None)
 
 
 def test_compare_draws_for_each_run_by_itself():
     """A rule that samples: runs in a piece of their own give what they give among others."""
-    choice = RuleChoice("harmonic_mean", HarmonicMeanParams(method="sampling", samples=50))
+    choice = RuleChoice.of("harmonic_mean", method="sampling", samples=50)
     whole = sharma_network_2.SCENARIO.compare([choice], [1, 2, 3], 4, lambda share: None)
     part = sharma_network_2.SCENARIO.compare([choice], [3], 4, lambda share: None)
     for name, values in whole.items():

@@ -8,9 +8,6 @@ from scipy.stats import chi2, kstest
 
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.params import ParameterError
-from track_fusion.rules.naive import NaiveParams
-from track_fusion.rules.split_covariance_intersection import SplitCovarianceIntersectionParams
-from track_fusion.scenarios import judged_claims
 from track_fusion.scenarios.sharma import radar_runs as sharma_radar_runs
 from track_fusion.scenarios.sharma.radar_runs import (
     CATEGORIES,
@@ -32,6 +29,7 @@ from track_fusion.scenarios.sharma.radar_runs import (
 )
 from track_fusion.scenarios.sharma.radars import ALONE, CI, HMD, ICI, SCENARIO
 from track_fusion.scenarios.sharma.surveillance import Courses, Radar, Surveillance
+from track_fusion.study.judgement import judged_claims
 from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.tracks import TrackBatch
 
@@ -169,7 +167,7 @@ def test_runs_and_rows_do_not_depend_on_what_else_is_asked(quiet):
 
 
 def test_compare_pools_all_judged_targets_from_the_settled_time_on(quiet):
-    rules = (RuleChoice("naive", NaiveParams(), "mine"), RULE_CHOICES[0])
+    rules = (RuleChoice.of("naive", "mine"), RULE_CHOICES[0])
     found = SCENARIO.compare(rules, [0], 2, lambda share: None)
     assert set(found) == {f"pda-{r}/{q}" for r in ("naive@mine", CI) for q in ("position_rmse_m", "lost_1")}
     record = tracked({"x": RULE_CHOICES[0]}, [0], 2, lambda share: None)
@@ -187,7 +185,7 @@ def test_compare_pools_all_judged_targets_from_the_settled_time_on(quiet):
 
 
 def test_a_rule_that_needs_more_than_tracks_is_refused():
-    choice = RuleChoice("split_covariance_intersection", SplitCovarianceIntersectionParams())
+    choice = RuleChoice.of("split_covariance_intersection")
     with pytest.raises(ParameterError, match="beside the tracks"):
         SCENARIO.compare([choice], [0], 0, lambda share: None)
 

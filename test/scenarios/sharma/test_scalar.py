@@ -5,12 +5,9 @@ import pytest
 
 from track_fusion.params import ParameterError
 from track_fusion.random_streams import stream
-from track_fusion.rules.harmonic_mean import HarmonicMeanParams
-from track_fusion.rules.mixture_exact import MixtureExactParams
-from track_fusion.rules.naive import NaiveParams
-from track_fusion.scenarios import judged_claims
 from track_fusion.scenarios.sharma import scalar as sharma_scalar
 from track_fusion.scenarios.sharma.scalar import RULE_CHOICES, SCENARIO, SETTINGS, STEPS, figures, simulate
+from track_fusion.study.judgement import judged_claims
 from track_fusion.study.rule_choice import RuleChoice
 
 RUNS = 200
@@ -97,7 +94,7 @@ def test_charts_show_the_weights_over_the_steps(outcomes):
 
 
 def test_compare_takes_any_rule_and_refuses_what_needs_more(outcomes):
-    choices = (RuleChoice("naive", NaiveParams()), RULE_CHOICES[-1])
+    choices = (RuleChoice.of("naive"), RULE_CHOICES[-1])
     found = SCENARIO.compare(choices, range(RUNS), 1, lambda share: None)
     assert len(found) == 2 * 2 * len(SETTINGS)  # errors and their consistency
     consistency = found["kf-harmonic_mean/consistency_q1_rho0_1"]
@@ -110,13 +107,13 @@ def test_compare_takes_any_rule_and_refuses_what_needs_more(outcomes):
     steady = SETTINGS[4].ratio * (np.sqrt(1.25) - 0.5)  # P of a random walk with q = r = 1
     assert (found[f"kf-naive/rmse_{name}_1"] ** 2).mean() == pytest.approx(steady, rel=0.05)
     with pytest.raises(ParameterError, match="Got 'mixture_exact', which needs 'common' beside"):
-        SCENARIO.compare([RuleChoice("mixture_exact", MixtureExactParams())], [0], 0, lambda share: None)
+        SCENARIO.compare([RuleChoice.of("mixture_exact")], [0], 0, lambda share: None)
 
 
 def test_compare_draws_for_each_run_by_itself(monkeypatch):
     """A rule that samples: runs in a piece of their own give what they give among others."""
     monkeypatch.setattr(sharma_scalar, "SETTINGS", SETTINGS[:1])
-    choice = RuleChoice("harmonic_mean", HarmonicMeanParams(method="sampling", samples=10))
+    choice = RuleChoice.of("harmonic_mean", method="sampling", samples=10)
     whole = SCENARIO.compare([choice], [2, 3], 4, lambda share: None)
     part = SCENARIO.compare([choice], [3], 4, lambda share: None)
     for name, values in part.items():

@@ -125,11 +125,7 @@ def _range(used: NDArray[np.bool_]) -> slice:
 
 
 def scores(
-    draw: Callable[[int, int], Problem],
-    rules: Sequence[RuleChoice],
-    runs: Sequence[int],
-    seed: int,
-    progress: Progress,
+    draw: Callable[[int, int], Problem], rules: Sequence[RuleChoice], runs: Sequence[int], seed: int, progress: Progress
 ) -> Outcomes:
     """Fuse the problems draw(seed, run) by any rules: divergence of the exactly fused density from what each gives."""
 

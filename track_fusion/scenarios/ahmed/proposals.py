@@ -18,29 +18,13 @@ from track_fusion.densities.mixture.proposals import (
     laplace_proposals,
     prune_mixands,
 )
-from track_fusion.densities.mixture.quotient import (
-    Bound,
-    Laplace,
-    Quotient,
-    exact_bound,
-    exact_quotient,
-    laplace,
-)
+from track_fusion.densities.mixture.quotient import Bound, Laplace, Quotient, exact_bound, exact_quotient, laplace
 from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.params import from_dict
 from track_fusion.random_streams import stream
 from track_fusion.rules import RULES
 from track_fusion.scenarios.ahmed import PAPER
-from track_fusion.scenarios.ahmed.mixtures import (
-    CELL_AREA,
-    GRID,
-    INGIS_VARIANCE,
-    Problem,
-    contour_chart,
-    scores,
-    shown,
-)
+from track_fusion.scenarios.ahmed.mixtures import CELL_AREA, GRID, INGIS_VARIANCE, Problem, contour_chart, scores, shown
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.claim import Claim
 from track_fusion.study.rows import Outcomes, Progress, chosen, run_by_run
@@ -71,8 +55,7 @@ VALUES: dict[str, dict[str, Any]] = {
     for proposal in PROPOSALS
 } | {"laplace": {"method": "laplace"}}
 RULE_CHOICES = tuple(
-    RuleChoice("mixture_exact", from_dict(RULES["mixture_exact"].params, {"max_components": 0} | values), variant)
-    for variant, values in VALUES.items()
+    RuleChoice.of("mixture_exact", variant, max_components=0, **values) for variant, values in VALUES.items()
 )
 
 
@@ -224,48 +207,21 @@ def _all_mixands(outcomes: Outcomes) -> Iterator[Chart]:
 TIE = 1e-9
 
 CLAIMS = (
-    Claim.least(
-        "LAGIS and heavy tails have more effective samples than INGIS, on average over the mixands",
-        "Section 5.2, Fig. 8(a)",
-        _row("ingis", "ess_1"),
-        [_row(proposal, "ess_1") for proposal in PROPOSALS[1:]],
-    ),
-    Claim.above(
-        "LAGIS or heavy tails give the best effective sample size generally (judged: of nine in ten mixands)",
-        "Section 5.2, Fig. 8(a)",
-        0.9,
-        _row("ingis", "beaten_1"),
-    ),
-    Claim.above(
-        "heavy tails are sometimes worse than LAGIS (judged: in more than a twentieth of the mixands)",
-        "Section 5.2, Fig. 8(a)",
-        0.05,
-        _row("heavy_tail", "below_lagis_1"),
-    ),
-    Claim.order(
-        "divergence from the truth, from the least: heavy tails, LAGIS, INGIS, Laplace without sampling",
-        "Fig. 7",
-        *(_row(variant, "kld_nats") for variant in ("heavy_tail", "lagis", "ingis", "laplace")),
-    ),
-    Claim.above(
-        "no mixand weighs more than its bound",
-        "Eq. (56), Fig. 8(b)",
-        1.0 - TIE,
-        _row("bound", "holds_1"),
-    ),
-    Claim.above(
-        "the bound is loose: in the median mixand by more than a factor e",
-        "Section 5.2, Fig. 8(b)",
-        1.0,
-        _row("bound", "looseness_nats"),
-    ),
-    Claim.below(
-        "an extremely small bound tells negligible mixands: those 14 nats below weigh less than a thousandth",
-        "Section 5.2, Fig. 8(b)",
-        1e-3,
-        _row("bound", "negligible_weight_1"),
-    ),
-)
+    Claim.least("LAGIS and heavy tails have more effective samples than INGIS, on average over the mixands",
+                "Section 5.2, Fig. 8(a)", _row("ingis", "ess_1"),
+                [_row(proposal, "ess_1") for proposal in PROPOSALS[1:]]),
+    Claim.above("LAGIS or heavy tails give the best effective sample size generally (judged: of nine in ten mixands)",
+                "Section 5.2, Fig. 8(a)", 0.9, _row("ingis", "beaten_1")),
+    Claim.above("heavy tails are sometimes worse than LAGIS (judged: in more than a twentieth of the mixands)",
+                "Section 5.2, Fig. 8(a)", 0.05, _row("heavy_tail", "below_lagis_1")),
+    Claim.order("divergence from the truth, from the least: heavy tails, LAGIS, INGIS, Laplace without sampling",
+                "Fig. 7", *(_row(variant, "kld_nats") for variant in ("heavy_tail", "lagis", "ingis", "laplace"))),
+    Claim.above("no mixand weighs more than its bound", "Eq. (56), Fig. 8(b)", 1.0 - TIE, _row("bound", "holds_1")),
+    Claim.above("the bound is loose: in the median mixand by more than a factor e", "Section 5.2, Fig. 8(b)",
+                1.0, _row("bound", "looseness_nats")),
+    Claim.below("an extremely small bound tells negligible mixands: those 14 nats below weigh less than a thousandth",
+                "Section 5.2, Fig. 8(b)", 1e-3, _row("bound", "negligible_weight_1")),
+)  # fmt: skip
 
 SCENARIO = Scenario(
     key="ahmed-proposals",

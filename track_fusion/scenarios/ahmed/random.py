@@ -12,18 +12,10 @@ import numpy as np
 from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.params import from_dict
 from track_fusion.random_streams import stream
-from track_fusion.rules import RULES, FusedTracks
+from track_fusion.rules import FusedTracks
 from track_fusion.scenarios.ahmed import PAPER
-from track_fusion.scenarios.ahmed.mixtures import (
-    INGIS_VARIANCE,
-    Problem,
-    contour_chart,
-    log_fused,
-    scores,
-    shown,
-)
+from track_fusion.scenarios.ahmed.mixtures import INGIS_VARIANCE, Problem, contour_chart, log_fused, scores, shown
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.claim import Claim, ascending
 from track_fusion.study.rows import Outcomes, Progress, chosen, run_by_run
@@ -69,7 +61,7 @@ def _choice(key: str, variant: str, **values: Any) -> RuleChoice:
         # As the paper has it, omega is sought on one set of samples, whatever its error.
         common |= {"criterion": "minimax_information_loss", "samples": OMEGA_SAMPLES, "omega_proposal": "first_order"}
         common["omega_error"] = 1.0
-    return RuleChoice(key, from_dict(RULES[key].params, common | values), variant)
+    return RuleChoice.of(key, variant, **common | values)
 
 
 def _dls(key: str, variant: str, count: int) -> RuleChoice:

@@ -70,7 +70,7 @@ RULE_CHOICES = (
     RuleChoice("mixture_exact", dataclasses.replace(DLS, method="igs", samples=2000), "igs"),
     RuleChoice("mixture_exact", dataclasses.replace(DLS, method="mmgd"), "mmgd"),
     RuleChoice("mixture_wep", WEP),
-    RuleChoice("mixture_wep", MixtureWepParams(method="naive_bayes", max_components=COMPONENTS), "naive_bayes"),
+    RuleChoice.of("mixture_wep", "naive_bayes", method="naive_bayes", max_components=COMPONENTS),
 )
 #: The centre; robot 3 before it hears of the others; the quotient of the robots' mixtures itself, on the grid.
 CENTRE, ALONE, QUOTIENT = "gm-ic", "gm-alone", "gm-mixture_exact@unapproximated"
@@ -269,33 +269,18 @@ def _ways() -> tuple[Series, ...]:
 
 
 CLAIMS = (
-    Claim(
-        "the centralised mixture of 50 components is a very close approximation of the true posterior "
-        "(judged: at most a tenth as far from it as robot 3's before fusion)",
-        "5.3, Fig. 9 (b)",
-        (f"{CENTRE}/kld_from_bayes_nats", f"{ALONE}/kld_from_bayes_nats"),
-        lambda centre, alone: [0.1 * alone - centre],
-    ),
-    Claim.order(
-        "fusion brings robot 3 nearer to the centralised mixture than it was alone",
-        "5.3, Fig. 9 (c), (d)",
-        "gm-mixture_exact/kld_nats",
-        f"{ALONE}/kld_nats",
-    ),
-    Claim.order(
-        "replacing the common information by one Gaussian (MMGD) loses more than sampling the quotient",
-        "2.4, 5.1",
-        "gm-mixture_exact/kld_nats",
-        "gm-mixture_exact@mmgd/kld_nats",
-    ),
-    Claim.order(
-        "the modes near the target are diminished by decentralised fusion and its repeated compression "
-        "(judged: mass within 1.5 m of it below the centralised mixture's)",
-        "5.3, Fig. 9 (d)",
-        "gm-mixture_exact/mass_near_target_1",
-        f"{CENTRE}/mass_near_target_1",
-    ),
-)
+    Claim("the centralised mixture of 50 components is a very close approximation of the true posterior "
+          "(judged: at most a tenth as far from it as robot 3's before fusion)", "5.3, Fig. 9 (b)",
+          (f"{CENTRE}/kld_from_bayes_nats", f"{ALONE}/kld_from_bayes_nats"),
+          lambda centre, alone: [0.1 * alone - centre]),
+    Claim.order("fusion brings robot 3 nearer to the centralised mixture than it was alone", "5.3, Fig. 9 (c), (d)",
+                "gm-mixture_exact/kld_nats", f"{ALONE}/kld_nats"),
+    Claim.order("replacing the common information by one Gaussian (MMGD) loses more than sampling the quotient",
+                "2.4, 5.1", "gm-mixture_exact/kld_nats", "gm-mixture_exact@mmgd/kld_nats"),
+    Claim.order("the modes near the target are diminished by decentralised fusion and its repeated compression "
+                "(judged: mass within 1.5 m of it below the centralised mixture's)", "5.3, Fig. 9 (d)",
+                "gm-mixture_exact/mass_near_target_1", f"{CENTRE}/mass_near_target_1"),
+)  # fmt: skip
 
 
 SCENARIO = Scenario(

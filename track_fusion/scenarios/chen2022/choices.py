@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
-from track_fusion.rules.fast_covariance_intersection import FastCovarianceIntersectionParams
-from track_fusion.rules.geodesic_projection import GeodesicProjectionParams
-from track_fusion.rules.mhdp_explicit import MhdpExplicitParams
-from track_fusion.rules.mhdp_iterative import MhdpIterativeParams
-from track_fusion.rules.quasi_minimal_manhattan import QuasiMinimalManhattanParams
 from track_fusion.study.rule_choice import RuleChoice
 
-DCI = RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="det"))
-FCI = RuleChoice("fast_covariance_intersection", FastCovarianceIntersectionParams())
-KLA = RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="uniform"), "uniform")
-GP = RuleChoice("geodesic_projection", GeodesicProjectionParams())
-QMMHD = RuleChoice("quasi_minimal_manhattan", QuasiMinimalManhattanParams())
-MHDP_E = RuleChoice("mhdp_explicit", MhdpExplicitParams())
-MHDP_I = RuleChoice("mhdp_iterative", MhdpIterativeParams())
-UNSQUARED = RuleChoice("mhdp_explicit", MhdpExplicitParams(criterion="unsquared"), "unsquared")
+DCI = RuleChoice.of("covariance_intersection", criterion="det")
+FCI = RuleChoice.of("fast_covariance_intersection")
+KLA = RuleChoice.of("covariance_intersection", "uniform", criterion="uniform")
+GP = RuleChoice.of("geodesic_projection")
+QMMHD = RuleChoice.of("quasi_minimal_manhattan")
+MHDP_E = RuleChoice.of("mhdp_explicit")
+MHDP_I = RuleChoice.of("mhdp_iterative")
+UNSQUARED = RuleChoice.of("mhdp_explicit", "unsquared", criterion="unsquared")

@@ -100,13 +100,8 @@ def row_name(choice: RuleChoice, setting: str) -> str:
 ROWS = {row_name(choice, name): (choice, setting) for name, setting in SETTINGS.items() for choice in RULE_CHOICES}
 
 
-def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
-    """Fuse by the rows whose names start with `only`: {row/fused: mean and scatter, (R, 2)}; nothing is random."""
-    rows = {name: partial(_fused, *row) for name, row in ROWS.items()}
-    return exact_rows(rows, runs, seed, progress, only)
-
-
-def _fused(choice: RuleChoice, setting: Setting) -> dict[str, Array]:
+def fused(choice: RuleChoice, setting: Setting) -> dict[str, Array]:
+    """Fuse one row: mean and scatter, (2,); nothing is random."""
     return {"fused": setting.fuse(choice)}
 
 
@@ -208,7 +203,7 @@ SCENARIO = Scenario(
         "MHDP minimises the sum of squared distances; @unsquared: that of the distances, as printed, which makes one "
         "sensor's estimate the fused mean",
     ),
-    simulate=simulate,
+    simulate=partial(exact_rows, {name: partial(fused, *row) for name, row in ROWS.items()}),
     figures=figures,
     charts=charts,
     claims=CLAIMS,

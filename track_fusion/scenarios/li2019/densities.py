@@ -11,8 +11,6 @@ import numpy as np
 from track_fusion.densities.gaussian import weighted_product
 from track_fusion.linalg import Array, merged_moments
 from track_fusion.rules import SourceTracks
-from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
-from track_fusion.rules.geometric_average import GeometricAverageParams
 from track_fusion.scenarios.li2019 import PAPER
 from track_fusion.scenarios.li2019.averages import density_average, density_moments
 from track_fusion.study.chart import Chart, Contours, Series
@@ -26,8 +24,8 @@ WEIGHT = np.linspace(0.0, 1.0, 101)[1:-1]
 THETA = np.linspace(40.0, 80.0, 401)
 AA, GA = "given-arithmetic_average", "given-geometric_average"
 RULE_CHOICES = (
-    RuleChoice("arithmetic_average", ArithmeticAverageParams(criterion="given", weights=(0.5, 0.5))),
-    RuleChoice("geometric_average", GeometricAverageParams(criterion="given", weights=(0.5, 0.5))),
+    RuleChoice.of("arithmetic_average", criterion="given", weights=(0.5, 0.5)),
+    RuleChoice.of("geometric_average", criterion="given", weights=(0.5, 0.5)),
 )
 
 
@@ -256,12 +254,8 @@ def _figures(quantity: str, average: str = AA) -> tuple[str, ...]:
 
 
 CLAIMS = (
-    Claim(
-        "At the same weights the variance of the arithmetic average is greater than that of the geometric.",
-        "Remark 5",
-        _figures("least_excess_variance_1"),
-        lambda *excesses: excesses,
-    ),
+    Claim("At the same weights the variance of the arithmetic average is greater than that of the geometric.",
+          "Remark 5", _figures("least_excess_variance_1"), lambda *excesses: excesses),
     Claim(
         "The variance of the geometric average lies between those of its sources.",
         "Remark 5, (36)",
@@ -278,32 +272,19 @@ CLAIMS = (
         (f"{AA}@far/variance_ratio_1",),
         lambda ratio: [ratio - 1.0],
     ),
-    Claim(
-        "The mean square error of the arithmetic average lies between those of its sources.",
-        "Remark 6",
-        (*_figures("least_mse_ratio_1"), *_figures("greatest_mse_ratio_1")),
-        lambda a, b, c, d: [_not_below(a, 1.0), _not_below(b, 1.0), _not_above(c, 1.0), _not_above(d, 1.0)],
-        by_construction="a weighted mean lies between what it averages",
-    ),
-    Claim(
-        "The mean square error of the geometric average is no less than the least variance of its sources.",
-        "(42)",
-        _figures("least_mse_1", GA),
-        lambda *errors: [_not_below(e, least) for e, least in zip(errors, LEAST_VARIANCES, strict=True)],
-    ),
-    Claim(
-        "Densities of the same variance, or both with the parameter as their mean: the mean square error of the "
-        "geometric average is no greater than that of the arithmetic.",
-        "Remark 7",
-        (f"{AA}@same_variance/least_excess_mse_1", f"{AA}@same_mean/least_excess_mse_1"),
-        lambda *excesses: [excess + TIE for excess in excesses],
-    ),
-    Claim(
-        "In most cases the mean square error of the arithmetic average is greater than that of the geometric.",
-        "Remark 8",
-        _figures("greater_mse_share_1"),
-        lambda *shares: [share - 0.5 for share in shares],
-    ),
+    Claim("The mean square error of the arithmetic average lies between those of its sources.", "Remark 6",
+          (*_figures("least_mse_ratio_1"), *_figures("greatest_mse_ratio_1")),
+          lambda a, b, c, d: [_not_below(a, 1.0), _not_below(b, 1.0), _not_above(c, 1.0), _not_above(d, 1.0)],
+          by_construction="a weighted mean lies between what it averages"),
+    Claim("The mean square error of the geometric average is no less than the least variance of its sources.", "(42)",
+          _figures("least_mse_1", GA),
+          lambda *errors: [_not_below(e, least) for e, least in zip(errors, LEAST_VARIANCES, strict=True)]),
+    Claim("Densities of the same variance, or both with the parameter as their mean: the mean square error of the "
+          "geometric average is no greater than that of the arithmetic.", "Remark 7",
+          (f"{AA}@same_variance/least_excess_mse_1", f"{AA}@same_mean/least_excess_mse_1"),
+          lambda *excesses: [excess + TIE for excess in excesses]),
+    Claim("In most cases the mean square error of the arithmetic average is greater than that of the geometric.",
+          "Remark 8", _figures("greater_mse_share_1"), lambda *shares: [share - 0.5 for share in shares]),
     Claim(
         "It is smaller only where the parameter is well above both means and the density with the greater mean has the "
         "greater variance (in Fig. 5 above 60; never in Fig. 6).",
@@ -313,29 +294,16 @@ CLAIMS = (
     ),
     Claim(
         "For given densities and parameter one of the two averages has the smaller mean square error at all weights.",
-        "Remark 8",
-        _figures("crossed_theta_share_1"),
-        lambda *shares: [TIE - share for share in shares],
+        "Remark 8", _figures("crossed_theta_share_1"), lambda *shares: [TIE - share for share in shares],
     ),
-    Claim(
-        "The uniform density is an unbiased estimator on the interval (0, 1] that is printed.",
-        "Appendix B",
-        ("given-alone@appendix_uniform_to_1/mean_1",),
-        lambda mean: within(mean - PARAMETER, TIE),
-    ),
-    Claim(
-        "It is on (0, 4 sqrt(2)/3], and so are the other density and the arithmetic average.",
-        "Appendix B, (30)",
-        ("given-alone@appendix_uniform/mean_1", "given-alone@appendix_rising/mean_1", f"{AA}@appendix/mean_1"),
-        lambda *means: [margin for mean in means for margin in within(mean - PARAMETER, TIE)],
-    ),
-    Claim.order(
-        "The geometric average of unbiased densities is biased.",
-        "4.1, Appendix B",
-        f"{GA}@appendix/mean_1",
-        f"{AA}@appendix/mean_1",
-    ),
-)
+    Claim("The uniform density is an unbiased estimator on the interval (0, 1] that is printed.", "Appendix B",
+          ("given-alone@appendix_uniform_to_1/mean_1",), lambda mean: within(mean - PARAMETER, TIE)),
+    Claim("It is on (0, 4 sqrt(2)/3], and so are the other density and the arithmetic average.", "Appendix B, (30)",
+          ("given-alone@appendix_uniform/mean_1", "given-alone@appendix_rising/mean_1", f"{AA}@appendix/mean_1"),
+          lambda *means: [margin for mean in means for margin in within(mean - PARAMETER, TIE)]),
+    Claim.order("The geometric average of unbiased densities is biased.", "4.1, Appendix B",
+                f"{GA}@appendix/mean_1", f"{AA}@appendix/mean_1"),
+)  # fmt: skip
 
 SCENARIO = Scenario(
     key="li2019-densities",

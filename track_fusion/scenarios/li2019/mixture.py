@@ -10,15 +10,8 @@ import numpy as np
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.linalg import Array
-from track_fusion.rules.mixture_average import MixtureAverageParams
-from track_fusion.rules.mixture_hybrid import MixtureHybridParams
 from track_fusion.scenarios.li2019 import PAPER
-from track_fusion.scenarios.li2019.common import (
-    exact_geometric,
-    fused_intensity,
-    intensity,
-    scalar_mixture,
-)
+from track_fusion.scenarios.li2019.common import exact_geometric, fused_intensity, intensity, scalar_mixture
 from track_fusion.study.chart import Chart, Series
 from track_fusion.study.claim import Claim, within
 from track_fusion.study.rows import Outcomes, Progress, exact_figures, exact_rows
@@ -39,8 +32,8 @@ STEP = float(X[1] - X[0])
 #: Beyond this distance from the targets and from the isolated component, two of its standard deviations, is the tail.
 TAIL = 2.0 * np.sqrt(200.0)
 
-AVERAGE = RuleChoice("mixture_average", MixtureAverageParams(max_components=0))
-HYBRID = RuleChoice("mixture_hybrid", MixtureHybridParams(max_components=0))
+AVERAGE = RuleChoice.of("mixture_average", max_components=0)
+HYBRID = RuleChoice.of("mixture_hybrid", max_components=0)
 AA, GA, EXACT = "given-mixture_average", "given-mixture_hybrid", "given-mixture_hybrid@exact"
 
 
@@ -147,54 +140,33 @@ def _component_chart() -> Chart:
 
 
 CLAIMS = (
-    Claim(
-        "The weights of the geometric average sum to the average of the sources' sums.",
-        "5.1",
-        (f"{GA}/expected_targets_1", "given-alone@gm1/expected_targets_1", "given-alone@gm2/expected_targets_1"),
-        lambda fused, first, second: within(fused - 0.5 * (first + second), 1e-6),
-        by_construction="its weights are scaled to that sum",
-    ),
+    Claim("The weights of the geometric average sum to the average of the sources' sums.", "5.1",
+          (f"{GA}/expected_targets_1", "given-alone@gm1/expected_targets_1", "given-alone@gm2/expected_targets_1"),
+          lambda fused, first, second: within(fused - 0.5 * (first + second), 1e-6),
+          by_construction="its weights are scaled to that sum"),
     *(
-        Claim.order(
-            f"The geometric average has the higher peak at target {k}.",
-            "Remark 9",
-            f"{AA}/peak_target{k}_1",
-            f"{GA}/peak_target{k}_1",
-        )
+        Claim.order(f"The geometric average has the higher peak at target {k}.", "Remark 9",
+                    f"{AA}/peak_target{k}_1", f"{GA}/peak_target{k}_1")
         for k in (1, 2)
     ),
     *(
-        Claim.order(
-            f"The heaviest component of the geometric average at target {k} outweighs each of the arithmetic.",
-            "Remark 9",
-            f"{AA}/component{theirs}_weight_1",
-            f"{GA}/component{ours}_weight_1",
-        )
+        Claim.order(f"The heaviest component of the geometric average at target {k} outweighs each of the arithmetic.",
+                    "Remark 9", f"{AA}/component{theirs}_weight_1", f"{GA}/component{ours}_weight_1")
         for k, theirs, ours in ((1, 2, 1), (2, 4, 5))
     ),
     *(
-        Claim.order(
-            f"Without the approximation (49) the geometric average has the higher peak at target {k}.",
-            "Remark 9",
-            f"{AA}/peak_target{k}_1",
-            f"{EXACT}/peak_target{k}_1",
-        )
+        Claim.order(f"Without the approximation (49) the geometric average has the higher peak at target {k}.",
+                    "Remark 9", f"{AA}/peak_target{k}_1", f"{EXACT}/peak_target{k}_1")
         for k in (1, 2)
     ),
     Claim.order("The geometric average has lighter tails.", "Remark 9", f"{GA}/tail_mass_1", f"{AA}/tail_mass_1"),
-    Claim(
-        "The isolated component survives in the arithmetic average, a peak of less weight.",
-        "Remark 10",
-        (f"{AA}/peaks_1", f"{AA}/component5_weight_1"),
-        lambda peaks, weight: [*within(peaks - 3.0, 0.5), weight, PARTS.weight[0, 2] - weight],
-    ),
-    Claim(
-        "It almost vanishes from the geometric average: no peak is left of it.",
-        "Remark 10",
-        (f"{GA}/peaks_1", f"{GA}/isolated_1", f"{AA}/isolated_1"),
-        lambda peaks, geometric, arithmetic: [*within(peaks - 2.0, 0.5), arithmetic - geometric],
-    ),
-)
+    Claim("The isolated component survives in the arithmetic average, a peak of less weight.", "Remark 10",
+          (f"{AA}/peaks_1", f"{AA}/component5_weight_1"),
+          lambda peaks, weight: [*within(peaks - 3.0, 0.5), weight, PARTS.weight[0, 2] - weight]),
+    Claim("It almost vanishes from the geometric average: no peak is left of it.", "Remark 10",
+          (f"{GA}/peaks_1", f"{GA}/isolated_1", f"{AA}/isolated_1"),
+          lambda peaks, geometric, arithmetic: [*within(peaks - 2.0, 0.5), arithmetic - geometric]),
+)  # fmt: skip
 
 SCENARIO = Scenario(
     key="li2019-mixture",

@@ -14,15 +14,8 @@ from track_fusion.densities.mixture.mixture import Mixture
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.random_streams import stream
-from track_fusion.rules.mixture_average import MixtureAverageParams
-from track_fusion.rules.mixture_hybrid import MixtureHybridParams
 from track_fusion.scenarios.li2019 import PAPER
-from track_fusion.scenarios.li2019.common import (
-    exact_geometric,
-    fused_intensity,
-    intensity,
-    scalar_mixture,
-)
+from track_fusion.scenarios.li2019.common import exact_geometric, fused_intensity, intensity, scalar_mixture
 from track_fusion.study.chart import Chart, Series, estimates
 from track_fusion.study.claim import Claim
 from track_fusion.study.rows import Outcomes, Progress, chosen, row_by_row
@@ -41,9 +34,9 @@ BETWEEN = np.array([20.0, 30.0, 40.0])
 #: Where intensities that are no mixtures are evaluated: all mass inside, the edges of NEAR and FAR between two points.
 X = np.arange(-60.0, 280.0, 0.5) + 0.25
 
-AVERAGE = RuleChoice("mixture_average", MixtureAverageParams(max_components=0))
+AVERAGE = RuleChoice.of("mixture_average", max_components=0)
 #: Twenty components carry the masses to one part in a thousand, at a hundredth of the time that a hundred take.
-HYBRID = RuleChoice("mixture_hybrid", MixtureHybridParams(max_components=20))
+HYBRID = RuleChoice.of("mixture_hybrid", max_components=20)
 AA, GA, EXACT = "given-mixture_average", "given-mixture_hybrid", "given-mixture_hybrid@exact"
 
 
@@ -251,12 +244,8 @@ def _trial_chart(rows: Mapping[str, str]) -> Chart:
 
 
 CLAIMS = (
-    Claim.order(
-        "The geometric average loses targets that the arithmetic average keeps.",
-        "5.2, Fig. 8",
-        f"{AA}/lost_targets_1",
-        f"{GA}/lost_targets_1",
-    ),
+    Claim.order("The geometric average loses targets that the arithmetic average keeps.", "5.2, Fig. 8",
+                f"{AA}/lost_targets_1", f"{GA}/lost_targets_1"),
     Claim(
         "It mixes the targets at 20 and 40 (judged: in most trials), and the arithmetic average does not (in less than "
         "one of twenty).",
@@ -264,32 +253,18 @@ CLAIMS = (
         (f"{GA}/mixed_share_1", f"{AA}/mixed_share_1"),
         lambda geometric, arithmetic: [geometric - 0.5, 0.05 - arithmetic],
     ),
-    Claim.order(
-        "The more sensors, the more targets the geometric average loses.",
-        "5.2; 6, PHD fusion, conclusion 2",
-        *(f"{GA}@sensors{k}/lost_targets_1" for k in range(2, SENSORS)),
-        f"{GA}/lost_targets_1",
-    ),
+    Claim.order("The more sensors, the more targets the geometric average loses.", "5.2; 6, PHD fusion, conclusion 2",
+                *(f"{GA}@sensors{k}/lost_targets_1" for k in range(2, SENSORS)), f"{GA}/lost_targets_1"),
     Claim.above(
         "A target that one sensor misses is lost from the geometric average, whatever the other five see (judged: in "
-        "more than nine of ten cases).",
-        "5.2",
-        0.9,
-        f"{GA}/lost_missed_by_1_share_1",
+        "more than nine of ten cases).", "5.2",
+        0.9, f"{GA}/lost_missed_by_1_share_1",
     ),
-    Claim.order(
-        "The geometric average suppresses false alarms better: less mass far from all targets.",
-        "6, PHD fusion, conclusion 2",
-        f"{GA}/far_mass_1",
-        f"{AA}/far_mass_1",
-    ),
-    Claim.order(
-        "Without the approximation (49) the geometric average loses fewer targets.",
-        "5.2",
-        f"{EXACT}/lost_targets_1",
-        f"{GA}/lost_targets_1",
-    ),
-)
+    Claim.order("The geometric average suppresses false alarms better: less mass far from all targets.",
+                "6, PHD fusion, conclusion 2", f"{GA}/far_mass_1", f"{AA}/far_mass_1"),
+    Claim.order("Without the approximation (49) the geometric average loses fewer targets.", "5.2",
+                f"{EXACT}/lost_targets_1", f"{GA}/lost_targets_1"),
+)  # fmt: skip
 
 SCENARIO = Scenario(
     key="li2019-six-sensors",

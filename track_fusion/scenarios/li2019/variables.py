@@ -269,92 +269,56 @@ def _some_of_both(*shares: Array) -> list[Array]:
 def _error_claims(truth: int) -> tuple[Claim, Claim]:
     shares = tuple(f"{AA}@{v}/greater_share_mse_theta{truth}_1" for v in ("rho0", "rho70736"))
     return (
-        Claim(
-            f"Parameter {truth}: the mean square error of the arithmetic average is greater than that of the "
-            "geometric at some weights and smaller at others.",
-            "Remark 3",
-            shares,
-            _some_of_both,
-        ),
+        Claim(f"Parameter {truth}: the mean square error of the arithmetic average is greater than that of the "
+              "geometric at some weights and smaller at others.", "Remark 3",
+              shares, _some_of_both),
         _no_greater(
             f"Parameter {truth}: the least mean square error of the arithmetic average is no greater than that of "
-            "the geometric.",
-            "Remark 3",
-            ("rho0", "rho70736"),
-            f"least_mse_theta{truth}_1",
+            "the geometric.", "Remark 3",
+            ("rho0", "rho70736"), f"least_mse_theta{truth}_1",
         ),
-    )
+    )  # fmt: skip
 
 
 CLAIMS = (
-    Claim(
-        "The arithmetic average of unbiased variables is unbiased (mean 55 at equal weights).",
-        "3.1, (12)",
-        (f"{AA}@rho0/mean_half_1",),
-        lambda mean: within(mean - MEAN.mean(), UNBIASED),
-        by_construction="the mean of a sum is the sum of the means",
-    ),
-    Claim.order(
-        "The mean of the geometric average is below that of the arithmetic.",
-        "3.1",
-        f"{GA}@rho0/mean_half_1",
-        f"{AA}@rho0/mean_half_1",
-    ),
-    Claim(
-        "Below the correlation (22) some weights give the arithmetic average less variance than either variable.",
-        "Remark 1",
-        tuple(f"{AA}@{v}/{q}" for q in ("least_variance_1", "better_variance_1") for v in ("rho0", "rho60")),
-        lambda one, two, better_one, better_two: [better_one - one, better_two - two],
-    ),
-    Claim(
-        "Above it, at 0.70846, the least variance is that of the better variable.",
-        "(21), Fig. 1",
-        (f"{AA}@rho70846/least_variance_1", f"{AA}@rho70846/better_variance_1"),
-        lambda least, better: within(least / better - 1.0, 1e-3),
-    ),
+    Claim("The arithmetic average of unbiased variables is unbiased (mean 55 at equal weights).", "3.1, (12)",
+          (f"{AA}@rho0/mean_half_1",), lambda mean: within(mean - MEAN.mean(), UNBIASED),
+          by_construction="the mean of a sum is the sum of the means"),
+    Claim.order("The mean of the geometric average is below that of the arithmetic.", "3.1",
+                f"{GA}@rho0/mean_half_1", f"{AA}@rho0/mean_half_1"),
+    Claim("Below the correlation (22) some weights give the arithmetic average less variance than either variable.",
+          "Remark 1",
+          tuple(f"{AA}@{v}/{q}" for q in ("least_variance_1", "better_variance_1") for v in ("rho0", "rho60")),
+          lambda one, two, better_one, better_two: [better_one - one, better_two - two]),
+    Claim("Above it, at 0.70846, the least variance is that of the better variable.", "(21), Fig. 1",
+          (f"{AA}@rho70846/least_variance_1", f"{AA}@rho70846/better_variance_1"),
+          lambda least, better: within(least / better - 1.0, 1e-3)),
     *(
-        Claim(
-            f"{kind} variables: the arithmetic average has more variance at some weights, the geometric at others.",
-            f"Remark 2, {figure}",
-            tuple(f"{AA}@{v}/greater_share_variance_1" for v in variants),
-            _some_of_both,
-        )
+        Claim(f"{kind} variables: the arithmetic average has more variance at some weights, the geometric at others.",
+              f"Remark 2, {figure}", tuple(f"{AA}@{v}/greater_share_variance_1" for v in variants), _some_of_both)
         for kind, figure, variants in (("Normal", "Fig. 1", FIGURE_1), ("Poisson", "Fig. 2", FIGURE_2))
     ),
     _no_greater(
         "In Figs. 1 and 2 the least variance of the arithmetic average is no greater than that of the geometric.",
-        "Remark 2",
-        FIGURE_1 + FIGURE_2,
-        "least_variance_1",
+        "Remark 2", FIGURE_1 + FIGURE_2, "least_variance_1",
     ),
-    _no_greater(
-        "So it is for any two variables (here two independent lognormal ones of log-variance 1).",
-        "6, v-fusion, conclusion 2",
-        ("lognormal",),
-        "least_variance_1",
-    ),
+    _no_greater("So it is for any two variables (here two independent lognormal ones of log-variance 1).",
+                "6, v-fusion, conclusion 2", ("lognormal",), "least_variance_1"),
     *(claim for truth in TRUTHS for claim in _error_claims(truth)),
     Claim(
         "A parameter between the two means makes the correlation of the errors negative or zero (here 55, correlation "
-        "0.70736).",
-        "sentence after (26)",
-        (f"{AA}@theta55/beta_1",),
-        lambda beta: [TIE - beta],
+        "0.70736).", "sentence after (26)",
+        (f"{AA}@theta55/beta_1",), lambda beta: [TIE - beta],
     ),
-    Claim(
-        "A parameter on or between the two means always fulfils (26) (here 50, correlation 0.70736).",
-        "sentence after (26)",
-        (f"{AA}@theta50/beta_1", f"{AA}@theta50/limit_26_1"),
-        ascending,
-    ),
+    Claim("A parameter on or between the two means always fulfils (26) (here 50, correlation 0.70736).",
+          "sentence after (26)", (f"{AA}@theta50/beta_1", f"{AA}@theta50/limit_26_1"), ascending),
     Claim(
         "A correlation below ratio^(-1/2) gives weights (19) between 0 and 1, at which (20) is the least variance "
-        "(here variances 200 and 100, correlation 0.8; both need a correlation below ratio^(1/2), too).",
-        "(19)-(20)",
+        "(here variances 200 and 100, correlation 0.8; both need a correlation below ratio^(1/2), too).", "(19)-(20)",
         tuple(f"{AA}@swapped/{q}" for q in ("weight_19_1", "bound_20_1", "least_variance_1")),
         lambda weight, bound, least: [weight, 1.0 - weight, *within(bound - least, 1e-6 * least)],
     ),
-)
+)  # fmt: skip
 
 SCENARIO = Scenario(
     key="li2019-variables",

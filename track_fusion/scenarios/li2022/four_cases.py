@@ -12,13 +12,6 @@ from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.random_streams import stream
 from track_fusion.rules import RULES, FusedTracks, Rule, SourceTracks
-from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
-from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
-from track_fusion.rules.covariance_union import CovarianceUnionParams
-from track_fusion.rules.fault_tolerant_covariance_intersection import FaultTolerantCovarianceIntersectionParams
-from track_fusion.rules.geometric_average import GeometricAverageParams
-from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
-from track_fusion.rules.naive import NaiveParams
 from track_fusion.scenarios.li2022 import PAPER
 from track_fusion.study.chart import Chart, ellipse
 from track_fusion.study.claim import Claim, Margins, ascending
@@ -36,18 +29,18 @@ SECTION_2E = {f"given-covariance_intersection/weight_case_{case}_1": 0.3764 for 
 
 #: The schemes of Fig. 1.
 SCHEMES = (
-    RuleChoice("naive", NaiveParams()),
-    RuleChoice("geometric_average", GeometricAverageParams()),
-    RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="trace")),
-    RuleChoice("arithmetic_average", ArithmeticAverageParams(criterion="uniform")),
-    RuleChoice("covariance_union", CovarianceUnionParams(bound="min_trace"), "min_trace"),
-    RuleChoice("covariance_union", CovarianceUnionParams(bound="max_trace"), "max_trace"),
+    RuleChoice.of("naive"),
+    RuleChoice.of("geometric_average"),
+    RuleChoice.of("covariance_intersection", criterion="trace"),
+    RuleChoice.of("arithmetic_average", criterion="uniform"),
+    RuleChoice.of("covariance_union", "min_trace", bound="min_trace"),
+    RuleChoice.of("covariance_union", "max_trace", bound="max_trace"),
 )
 #: Rules that chain (19) adds, by the trace as all of it, and the covariance that bounds both tracks.
 CHAIN = (
-    RuleChoice("inverse_covariance_intersection", InverseCovarianceIntersectionParams(criterion="trace")),
-    RuleChoice("fault_tolerant_covariance_intersection", FaultTolerantCovarianceIntersectionParams(criterion="trace")),
-    RuleChoice("covariance_union", CovarianceUnionParams(criterion="trace")),
+    RuleChoice.of("inverse_covariance_intersection", criterion="trace"),
+    RuleChoice.of("fault_tolerant_covariance_intersection", criterion="trace"),
+    RuleChoice.of("covariance_union", criterion="trace"),
 )
 
 
@@ -58,7 +51,7 @@ def enough_for_two() -> list[Rule]:
 
 _NAMED = {choice.key for choice in (*SCHEMES, *CHAIN)}
 #: All other rules, as they are by default.
-OTHERS = tuple(RuleChoice(rule.key, rule.params()) for rule in enough_for_two() if rule.key not in _NAMED)
+OTHERS = tuple(RuleChoice.of(rule.key) for rule in enough_for_two() if rule.key not in _NAMED)
 RULE_CHOICES = (*SCHEMES, *CHAIN, *OTHERS)
 #: Traces that are equal may differ by rounding, relative.
 ROUNDING = 1e-9
@@ -69,7 +62,7 @@ TRACKS, MIXTURE = ("given-alone@track_1", "given-alone@track_2"), "given-arithme
 ROWS: dict[str, RuleChoice | None] = {
     **dict.fromkeys(TRACKS),
     **{f"given-{choice.name}": choice for choice in RULE_CHOICES},
-    MIXTURE: RuleChoice("arithmetic_average", ArithmeticAverageParams(criterion="uniform", output="mixture")),
+    MIXTURE: RuleChoice.of("arithmetic_average", criterion="uniform", output="mixture"),
 }
 
 
@@ -212,26 +205,17 @@ def _claims() -> tuple[Claim, ...]:
     inverse, tolerant, _ = (f"given-{choice.name}" for choice in CHAIN)
     apart = [
         dataclasses.replace(
-            Claim.close(
-                f"the covariance by {row.partition('-')[2]} does not depend on how far apart the means are",
-                "II-C",
-                ROUNDING,
-                *(f"{row}/trace_case_{case}_m2" for case in SEPARATIONS),
-            ),
+            Claim.close(f"the covariance by {row.partition('-')[2]} does not depend on how far apart the means are",
+                        "II-C", ROUNDING, *(f"{row}/trace_case_{case}_m2" for case in SEPARATIONS)),
             by_construction="the rule takes it from the covariances alone",
         )
         for row in (geometric, intersection)
-    ]
+    ]  # fmt: skip
     shapes = [
-        Claim.near(
-            f"({case}) the mixture before merging has {words}",
-            "II-E, Fig. 1",
-            count,
-            0.5,
-            f"{MIXTURE}/modes_case_{case}_1",
-        )
+        Claim.near(f"({case}) the mixture before merging has {words}", "II-E, Fig. 1",
+                   count, 0.5, f"{MIXTURE}/modes_case_{case}_1")
         for case, count, words in (("a", 1, "one mode"), ("c", 2, "two modes"), ("d", 2, "two modes"))
-    ]
+    ]  # fmt: skip
     return (
         _in_every_case(
             "chain (13), naive < min P <= CU min <= AA <= CU max",

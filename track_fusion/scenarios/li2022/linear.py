@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from track_fusion.filters.kalman import Kalman
@@ -9,25 +11,9 @@ from track_fusion.filters.particle import SirParams
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.scenarios.li2022 import PAPER
-from track_fusion.scenarios.li2022.claims import (
-    ASSUMPTIONS,
-    AVERAGE,
-    CREDIBILITY,
-    INTERSECTION,
-    POSITION,
-    VELOCITY,
-    balance_claims,
-    named,
-    union_claims,
-    weight_claims,
-)
-from track_fusion.scenarios.li2022.claims import (
-    RULES as ROWS,
-)
-from track_fusion.study.claim import Claim, ascending
-from track_fusion.study.one_target import RULE_CHOICES, Row, fused_row, gaussian_rows, same_filters, sir_rows
+from track_fusion.scenarios.li2022.claims import ASSUMPTIONS, linear_claims
+from track_fusion.study.one_target import RULE_CHOICES, fused_row, gaussian_rows, same_filters, sir_rows
 from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
-from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.study.scenario import Printed, Scenario
 from track_fusion.study.scene import Tracking
 from track_fusion.tracks import planar_layout
@@ -65,73 +51,11 @@ TRACKING = Tracking(
 )
 
 
-def kalman_row(choice: RuleChoice) -> Row:
-    """Two Kalman filters fused by any rule."""
-    return fused_row(TRACKING, KF, choice)
-
-
-def kalman_rows() -> dict[str, Row]:
-    """Rows of Table I by Kalman filters."""
-    return gaussian_rows("kf", TRACKING, KF, RULE_CHOICES)
-
-
-STUDY = OneTargetStudy(TRACKING, QUANTITIES, kalman_rows() | sir_rows(TRACKING, SIR, RULE_CHOICES), ("kf", kalman_row))
-
-
-#: Two rows are close to each other if all of Table I that the text calls so are: SIR-CI is 6 % above SIR-AA.
-CLOSE = 0.06
-_OTHERS = ("alone", "ic", AVERAGE, INTERSECTION, "covariance_union")
-
-
-def _claims() -> tuple[Claim, ...]:
-    claims = [
-        Claim.least(
-            "KF with both sensors' measurements (IC) is the best row of all",
-            "IV-A",
-            f"kf-ic/{POSITION}",
-            [n for one in ("kf", "sir") for n in named(POSITION, one, *ROWS) if n != f"kf-ic/{POSITION}"],
-        ),
-        Claim.each(
-            "the Kalman filter does better than the particle filter with every rule and alone",
-            "IV-A",
-            named(POSITION, "kf", *ROWS),
-            named(POSITION, "sir", *ROWS),
-            ascending,
-        ),
-        Claim.near(
-            "KF-IC is Bayes-optimal: what it claims is its mean squared error (credibility within 5 % of 1)",
-            "IV",
-            1.0,
-            0.05,
-            *named(CREDIBILITY, "kf", "ic"),
-        ),
-    ]
-    for one in ("kf", "sir"):
-        name = one.upper()
-        ic, average, intersection = named(POSITION, one, "ic", AVERAGE, INTERSECTION)
-        claims += [
-            Claim.greatest(
-                f"{name} with naive fusion is the worst row, worse than sensor 1 alone",
-                "IV-A",
-                f"{one}-naive/{POSITION}",
-                named(POSITION, one, *_OTHERS),
-            ),
-            Claim.close(
-                f"{name}: average and intersection are similar (within 6 %)", "IV-A", CLOSE, average, intersection
-            ),
-            Claim.close(f"{name}: the average is close to IC (within 6 %)", "IV-A", CLOSE, ic, average),
-            Claim.close(f"{name}: the intersection is close to IC (within 6 %)", "IV-A", CLOSE, ic, intersection),
-            Claim.order(f"{name}: the average beats the intersection in position", "Table I", average, intersection),
-            Claim.order(
-                f"{name}: the intersection beats the average in velocity",
-                "Table I",
-                *named(VELOCITY, one, INTERSECTION, AVERAGE),
-            ),
-            *union_claims(one, "IV-A"),
-            *balance_claims(one, "IV-A"),
-        ]
-    return (*claims, *weight_claims("kf", "IV-A, Fig. 6"))
-
+#: Rows of Table I by Kalman filters.
+KALMAN_ROWS = gaussian_rows("kf", TRACKING, KF, RULE_CHOICES)
+STUDY = OneTargetStudy(
+    TRACKING, QUANTITIES, KALMAN_ROWS | sir_rows(TRACKING, SIR, RULE_CHOICES), ("kf", partial(fused_row, TRACKING, KF))
+)
 
 SCENARIO = Scenario(
     key="li2022-linear",
@@ -146,7 +70,7 @@ SCENARIO = Scenario(
     simulate=STUDY.simulate,
     figures=STUDY.figures,
     charts=STUDY.charts,
-    claims=_claims(),
+    claims=linear_claims(),
     piece=50,
     tracking=TRACKING,
     rules=RULE_CHOICES,

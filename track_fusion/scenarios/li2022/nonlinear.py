@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from track_fusion.filters.cubature import Cubature
@@ -9,21 +11,9 @@ from track_fusion.filters.particle import SirParams
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
 from track_fusion.scenarios.li2022 import PAPER
-from track_fusion.scenarios.li2022.claims import (
-    ASSUMPTIONS,
-    AVERAGE,
-    INTERSECTION,
-    POSITION,
-    UNION,
-    balance_claims,
-    named,
-    union_claims,
-    weight_claims,
-)
-from track_fusion.study.claim import Claim, ascending
-from track_fusion.study.one_target import RULE_CHOICES, Row, fused_row, gaussian_rows, same_filters, sir_rows
+from track_fusion.scenarios.li2022.claims import ASSUMPTIONS, nonlinear_claims
+from track_fusion.study.one_target import RULE_CHOICES, fused_row, gaussian_rows, same_filters, sir_rows
 from track_fusion.study.one_target_study import OneTargetStudy, Quantity, published
-from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.study.scenario import Printed, Scenario
 from track_fusion.study.scene import Tracking
 from track_fusion.tracks import StateLayout
@@ -69,91 +59,9 @@ TRACKING = Tracking(
 )
 
 
-def cubature_row(choice: RuleChoice) -> Row:
-    """Two cubature Kalman filters fused by any rule."""
-    return fused_row(TRACKING, CKF, choice)
-
-
-def cubature_rows() -> dict[str, Row]:
-    """Rows of Table II by cubature Kalman filters."""
-    return gaussian_rows("ckf", TRACKING, CKF, RULE_CHOICES)
-
-
-STUDY = OneTargetStudy(
-    TRACKING, QUANTITIES, cubature_rows() | sir_rows(TRACKING, SIR, RULE_CHOICES), ("ckf", cubature_row)
-)
-
-
-#: Two rows are close to each other if all of Table II that the text calls so are: SIR-CI is 7 % above CKF-IC.
-CLOSE = 0.08
-#: Naive fusion has lost the target if it errs so many times as much as every other row of its filter.
-LOST = 3.0
-
-
-def _claims() -> tuple[Claim, ...]:
-    first, last = named("sensor_1_weight_first_1", "ckf", AVERAGE), named("sensor_1_weight_last_1", "ckf", AVERAGE)
-    but_ic = ("alone", "naive", AVERAGE, INTERSECTION, UNION)
-    claims = [
-        Claim.order(
-            "SIR with both sensors' measurements (IC) is worse than CKF-IC, and even than SIR with covariance union",
-            "IV-B",
-            f"ckf-ic/{POSITION}",
-            f"sir-{UNION}/{POSITION}",
-            f"sir-ic/{POSITION}",
-        ),
-        Claim.each(
-            "the particle filter does better than the cubature filter with every rule and alone, except IC",
-            "IV-B",
-            named(POSITION, "sir", *but_ic),
-            named(POSITION, "ckf", *but_ic),
-            ascending,
-        ),
-        Claim.order("the weight on sensor 1 falls from the first step to the last", "IV-B, Fig. 11", *last, *first),
-        *weight_claims("ckf", "IV-B, Fig. 11"),
-    ]
-    for rule in (AVERAGE, INTERSECTION):
-        names = [f"{one}-{rule}/{POSITION}" for one in ("ckf", "sir")]
-        claims.append(
-            Claim.close(f"particles do not degenerate under {rule}: SIR is within 8 % of CKF", "IV-B", CLOSE, *names)
-        )
-    for one in ("ckf", "sir"):
-        name, naive = one.upper(), f"{one}-naive/{POSITION}"
-        best = named(POSITION, one, AVERAGE, INTERSECTION)
-        claims += [
-            Claim.greatest(
-                f"{name} with naive fusion loses the target: three times the error of every other row",
-                "IV-B, Fig. 7",
-                naive,
-                named(POSITION, one, "alone", "ic", AVERAGE, INTERSECTION, UNION),
-                LOST,
-            ),
-            Claim.order(
-                f"{name} with covariance union is worse than with naive fusion (as the text has it, against Table II)",
-                "IV-B",
-                naive,
-                f"{one}-{UNION}/{POSITION}",
-            ),
-            Claim(
-                f"{name}: average and intersection are better than naive fusion and union",
-                "IV-B",
-                (*best, naive, f"{one}-{UNION}/{POSITION}"),
-                lambda *errors: [worse - better for better in errors[:2] for worse in errors[2:]],
-            ),
-            Claim.close(
-                f"{name}: the average is close to CKF-IC (within 8 %)", "IV-B", CLOSE, f"ckf-ic/{POSITION}", best[0]
-            ),
-            Claim.close(
-                f"{name}: the intersection is close to CKF-IC (within 8 %)",
-                "IV-B",
-                CLOSE,
-                f"ckf-ic/{POSITION}",
-                best[1],
-            ),
-            *union_claims(one, "IV-B"),
-            *balance_claims(one, "IV-B"),
-        ]
-    return tuple(claims)
-
+#: Rows of Table II.
+ROWS = gaussian_rows("ckf", TRACKING, CKF, RULE_CHOICES) | sir_rows(TRACKING, SIR, RULE_CHOICES)
+STUDY = OneTargetStudy(TRACKING, QUANTITIES, ROWS, ("ckf", partial(fused_row, TRACKING, CKF)))
 
 SCENARIO = Scenario(
     key="li2022-nonlinear",
@@ -172,7 +80,7 @@ SCENARIO = Scenario(
     simulate=STUDY.simulate,
     figures=STUDY.figures,
     charts=STUDY.charts,
-    claims=_claims(),
+    claims=nonlinear_claims(),
     piece=50,
     tracking=TRACKING,
     rules=RULE_CHOICES,

@@ -13,7 +13,6 @@ from track_fusion.densities.on_grid import kl_on_grid
 from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.rules import FusedTracks, SourceTracks
-from track_fusion.rules.arithmetic_average import ArithmeticAverageParams
 from track_fusion.scenarios.li2022 import PAPER
 from track_fusion.study.chart import Chart, Series, Style
 from track_fusion.study.claim import Claim, ascending, within
@@ -34,10 +33,10 @@ POINTS = np.linspace(LOW, HIGH, 20001)[:, None]
 DRAWN = slice(4000, 17001, 40)
 
 RULE_CHOICES = (
-    RuleChoice("arithmetic_average", ArithmeticAverageParams(criterion="target")),
-    RuleChoice("arithmetic_average", ArithmeticAverageParams(criterion="diversity"), "diversity"),
-    RuleChoice("arithmetic_average", ArithmeticAverageParams(criterion="uniform"), "uniform"),
-    RuleChoice("arithmetic_average", ArithmeticAverageParams(criterion="target_mixture"), "target_mixture"),
+    RuleChoice.of("arithmetic_average", criterion="target"),
+    RuleChoice.of("arithmetic_average", "diversity", criterion="diversity"),
+    RuleChoice.of("arithmetic_average", "uniform", criterion="uniform"),
+    RuleChoice.of("arithmetic_average", "target_mixture", criterion="target_mixture"),
 )
 #: The best fit of the merged Gaussian (39), the best of the mixture itself (33), and other weights.
 BEST, FITTED, OTHERS = RULE_CHOICES[0], RULE_CHOICES[3], RULE_CHOICES[1:3]
@@ -196,52 +195,32 @@ def _densities(case: str, outcomes: Outcomes) -> Chart:
 
 def _claims_of(case: str) -> list[Claim]:
     alone = tuple(f"{name}/kld_nats" for name in singles(case))
-    claims = [
-        Claim(
-            f"case {case}: the mixture diverges less than its components do on average (32)",
-            "III-A, Lemma 5",
-            (f"{mixture(case)}/kld_nats", f"{mixture(case)}/mean_kld_nats"),
-            ascending,
-            by_construction="the divergence is convex",
-        )
-    ]
-    claims.append(
-        Claim(
-            f"case {case}: the mixture at its own best weights (33) fits no worse than at those of the merged (39)",
-            "III-B, (33)",
-            (f"{fitted(case)}/kld_nats", f"{mixture(case)}/kld_nats"),
-            ascending,
-            by_construction="the weights (33) are the best that there are",
-        )
-    )
-    for row, how in ((best(case), "merged"), (mixture(case), "not merged"), (fitted(case), "fitted as a mixture")):
-        claims.append(
-            Claim(
-                f"case {case}: the average, {how}, fits the target better than the best single density",
-                "III-B, Fig. 2",
-                (f"{row}/kld_nats", *alone),
-                lambda first, *rest: [other - ROUNDING - first for other in rest],
-            )
-        )
-    return claims
+    ways = {best(case): "merged", mixture(case): "not merged", fitted(case): "fitted as a mixture"}
+    return [
+        Claim(f"case {case}: the mixture diverges less than its components do on average (32)", "III-A, Lemma 5",
+              (f"{mixture(case)}/kld_nats", f"{mixture(case)}/mean_kld_nats"), ascending,
+              by_construction="the divergence is convex"),
+        Claim(f"case {case}: the mixture at its own best weights (33) fits no worse than at those of the merged (39)",
+              "III-B, (33)", (f"{fitted(case)}/kld_nats", f"{mixture(case)}/kld_nats"), ascending,
+              by_construction="the weights (33) are the best that there are"),
+        *(
+            Claim(f"case {case}: the average, {how}, fits the target better than the best single density",
+                  "III-B, Fig. 2", (f"{row}/kld_nats", *alone),
+                  lambda first, *rest: [other - ROUNDING - first for other in rest])
+            for row, how in ways.items()
+        ),
+    ]  # fmt: skip
 
 
 def _claims() -> tuple[Claim, ...]:
     return (
         *(claim for case in ("1", "2", "3") for claim in _claims_of(case)),
-        Claim.below(
-            "case 1: the average has the very moments of the target",
-            "III-B, Fig. 2",
-            ROUNDING,
-            f"{best('1')}/kld_nats",
-        ),
-        Claim(
-            "case 4: the best fit is the single best density",
-            "III-B, Fig. 2",
-            (f"{best('4')}/kld_nats", *(f"{name}/kld_nats" for name in singles("4"))),
-            lambda first, *rest: within(first - np.min(rest, 0), ROUNDING),
-        ),
-    )
+        Claim.below("case 1: the average has the very moments of the target", "III-B, Fig. 2",
+                    ROUNDING, f"{best('1')}/kld_nats"),
+        Claim("case 4: the best fit is the single best density", "III-B, Fig. 2",
+              (f"{best('4')}/kld_nats", *(f"{name}/kld_nats" for name in singles("4"))),
+              lambda first, *rest: within(first - np.min(rest, 0), ROUNDING)),
+    )  # fmt: skip
 
 
 def _published() -> dict[str, float]:

@@ -15,8 +15,6 @@ from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate
 from track_fusion.random_streams import stream
 from track_fusion.rules import FusedTracks, SourceTracks
-from track_fusion.rules.geometric_mean_sampling import GeometricMeanSamplingParams
-from track_fusion.rules.harmonic_mean import HarmonicMeanParams
 from track_fusion.study.rows import Outcomes, Progress, chosen, row_by_row
 from track_fusion.study.rule_choice import RuleChoice
 
@@ -29,15 +27,9 @@ COVS = np.array([[[2.5, -1.0], [-1.0, 1.2]], [[0.8, -0.5], [-0.5, 4.0]]])
 #: Where densities are summed up: spacing a ninth of the smallest standard deviation, hardly anything outside.
 POINTS = grid(np.full(2, -14.0), np.full(2, 14.0), 280)
 
-HMD_GA = RuleChoice("harmonic_mean", HarmonicMeanParams(criterion="given", weights=HALF))
-HMD_S = RuleChoice(
-    "harmonic_mean",
-    HarmonicMeanParams(criterion="given", weights=HALF, method="sampling", samples=SAMPLES),
-    "sampled",
-)
-GMD_S = RuleChoice(
-    "geometric_mean_sampling", GeometricMeanSamplingParams(criterion="given", weights=HALF, samples=SAMPLES)
-)
+HMD_GA = RuleChoice.of("harmonic_mean", criterion="given", weights=HALF)
+HMD_S = RuleChoice.of("harmonic_mean", "sampled", criterion="given", weights=HALF, method="sampling", samples=SAMPLES)
+GMD_S = RuleChoice.of("geometric_mean_sampling", criterion="given", weights=HALF, samples=SAMPLES)
 
 
 @dataclasses.dataclass(frozen=True)

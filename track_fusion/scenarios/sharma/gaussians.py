@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from scipy.optimize import brentq
 
 from track_fusion.densities.mixture.mixture import Mixture
 from track_fusion.metrics.accuracy import Estimate
-from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
-from track_fusion.rules.ellipsoidal_intersection import EllipsoidalIntersectionParams
-from track_fusion.rules.harmonic_mean import HarmonicMeanParams
-from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
-from track_fusion.rules.naive import NaiveParams
 from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import densities as shared
 from track_fusion.scenarios.sharma.densities import COVS, GMD_S, HALF, HMD_GA, HMD_S, SAMPLES, Pair, Row
 from track_fusion.study.chart import Chart, Series, bars, ellipse, estimates
 from track_fusion.study.claim import Claim
-from track_fusion.study.rows import Outcomes, Progress
+from track_fusion.study.rows import Outcomes
 from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.study.scenario import Scenario
 
@@ -34,19 +28,17 @@ ALPHAS = (1.1, 1.2, 1.5)
 #: What counts as a small variation of alpha.
 SMALL_ALPHA = 1.5
 
-CI = RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="given", weights=HALF))
-ICI = RuleChoice(
-    "inverse_covariance_intersection", InverseCovarianceIntersectionParams(criterion="given", weights=HALF)
-)
+CI = RuleChoice.of("covariance_intersection", criterion="given", weights=HALF)
+ICI = RuleChoice.of("inverse_covariance_intersection", criterion="given", weights=HALF)
 #: Each at the weights that its own criterion finds, by the determinant.
 OWN_WEIGHTS = (
-    RuleChoice("covariance_intersection", CovarianceIntersectionParams(), "own_weights"),
-    RuleChoice("inverse_covariance_intersection", InverseCovarianceIntersectionParams(), "own_weights"),
-    RuleChoice("harmonic_mean", HarmonicMeanParams(), "own_weights"),
+    RuleChoice.of("covariance_intersection", "own_weights"),
+    RuleChoice.of("inverse_covariance_intersection", "own_weights"),
+    RuleChoice.of("harmonic_mean", "own_weights"),
 )
 RULE_CHOICES = (
-    RuleChoice("naive", NaiveParams()), CI, GMD_S, ICI,
-    RuleChoice("ellipsoidal_intersection", EllipsoidalIntersectionParams()), HMD_GA, HMD_S, *OWN_WEIGHTS,
+    RuleChoice.of("naive"), CI, GMD_S, ICI,
+    RuleChoice.of("ellipsoidal_intersection"), HMD_GA, HMD_S, *OWN_WEIGHTS,
 )  # fmt: skip
 
 
@@ -55,8 +47,8 @@ def _label(alpha: float) -> str:
 
 
 def _inflated(alpha: float) -> RuleChoice:
-    params = HarmonicMeanParams(criterion="given", weights=HALF, method="sampling", samples=SAMPLES, inflation=alpha)
-    return RuleChoice("harmonic_mean", params, f"sampled_{_label(alpha)}")
+    sampling = {"method": "sampling", "samples": SAMPLES, "inflation": alpha}
+    return RuleChoice.of("harmonic_mean", f"sampled_{_label(alpha)}", criterion="given", weights=HALF, **sampling)
 
 
 def _rows() -> dict[str, Row]:
@@ -72,11 +64,6 @@ def _rows() -> dict[str, Row]:
 
 ROWS = _rows()
 LEAST_ALPHA = "given-harmonic_mean@grid/least_alpha_1"
-
-
-def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
-    """Fuse (75)-(76) by the rows whose names start with `only`; see sharma_densities."""
-    return shared.simulate(ROWS, runs, seed, progress, only)
 
 
 def figures(outcomes: Outcomes) -> dict[str, Estimate]:
@@ -176,7 +163,7 @@ SCENARIO = Scenario(
         "divergence: of the exact harmonic mean density from the Gaussian with the fused moments",
         "the relative times of Table 1 are no figures, since times do not repeat: python -m benchmark --only rules",
     ),
-    simulate=simulate,
+    simulate=partial(shared.simulate, ROWS),
     figures=figures,
     charts=charts,
     claims=(
@@ -184,10 +171,8 @@ SCENARIO = Scenario(
             "The covariance shrinks from GMD-S to HMD-S to HMD-GA.", "5.2, Fig. 1a",
             "harmonic_mean", "harmonic_mean@sampled", "geometric_mean_sampling",
         ),
-        Claim.least(
-            "HMD-GA claims less than ICI, HMD-S and CI at the same weights.", "6, Fig. 1a, A",
-            f"given-{HMD_GA.name}/determinant_1", [f"given-{c.name}/determinant_1" for c in (ICI, HMD_S, CI)],
-        ),
+        Claim.least("HMD-GA claims less than ICI, HMD-S and CI at the same weights.", "6, Fig. 1a, A",
+                    f"given-{HMD_GA.name}/determinant_1", [f"given-{c.name}/determinant_1" for c in (ICI, HMD_S, CI)]),
         _order(
             "HMD-GA is tighter than ICI when each finds its own weights: (75)-(76).", "7",
             "harmonic_mean@own_weights", "inverse_covariance_intersection@own_weights",

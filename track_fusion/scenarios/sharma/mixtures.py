@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
 from track_fusion.densities.mixture.mean_density import Kind
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf
 from track_fusion.linalg import Array
-from track_fusion.metrics.accuracy import Estimate
-from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
-from track_fusion.rules.mixture_geometric import MixtureGeometricParams
 from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import densities as shared
 from track_fusion.scenarios.sharma.densities import COVS, GMD_S, HALF, HMD_GA, HMD_S, Pair
 from track_fusion.study.chart import Chart, Contours
 from track_fusion.study.claim import Claim
-from track_fusion.study.rows import Outcomes, Progress
+from track_fusion.study.rows import Outcomes
 from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.study.scenario import Scenario
 
@@ -32,8 +29,8 @@ PAIR = Pair(
 RULE_CHOICES = (
     GMD_S,
     HMD_S,
-    RuleChoice("mixture_geometric", MixtureGeometricParams(criterion="given", weights=HALF)),
-    RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="given", weights=HALF)),
+    RuleChoice.of("mixture_geometric", criterion="given", weights=HALF),
+    RuleChoice.of("covariance_intersection", criterion="given", weights=HALF),
     HMD_GA,
 )
 ROWS = {f"given-{choice.name}": PAIR.by_rule(choice) for choice in RULE_CHOICES} | {
@@ -43,16 +40,6 @@ ROWS = {f"given-{choice.name}": PAIR.by_rule(choice) for choice in RULE_CHOICES}
 #: Where contours are drawn, and at which shares of the highest density.
 X, Y = np.linspace(-6.0, 6.0, 61), np.linspace(-10.0, 7.0, 86)
 LEVELS = (0.05, 0.2, 0.5, 0.8)
-
-
-def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
-    """Fuse the mixtures by the rows whose names start with `only`; see sharma_densities."""
-    return shared.simulate(ROWS, runs, seed, progress, only)
-
-
-def figures(outcomes: Outcomes) -> dict[str, Estimate]:
-    """Moments, determinant and divergence of each row."""
-    return shared.figures(ROWS, outcomes)
 
 
 def charts(outcomes: Outcomes) -> list[Chart]:
@@ -92,24 +79,19 @@ SCENARIO = Scenario(
         "covariance_intersection, harmonic_mean: of the Gaussians with the mixtures' moments",
         "divergence: of the exact harmonic mean density from the fused mixture, or the Gaussian with the moments",
     ),
-    simulate=simulate,
-    figures=figures,
+    simulate=partial(shared.simulate, ROWS),
+    figures=partial(shared.figures, ROWS),
     charts=charts,
     claims=(
-        Claim.order(
-            "The uncertainty of HMD-S is less than that of GMD-S: by samples.",
-            "5.2, Fig. 2",
-            "given-harmonic_mean@sampled/determinant_1",
-            "given-geometric_mean_sampling/determinant_1",
-        ),
+        Claim.order("The uncertainty of HMD-S is less than that of GMD-S: by samples.", "5.2, Fig. 2",
+                    "given-harmonic_mean@sampled/determinant_1", "given-geometric_mean_sampling/determinant_1"),
         Claim.order(
             "The uncertainty of the harmonic mean is less than that of the geometric: the densities themselves.",
-            "5.2, Fig. 2",
-            "given-harmonic_mean@grid/determinant_1",
+            "5.2, Fig. 2", "given-harmonic_mean@grid/determinant_1",
             "given-geometric_mean_sampling@grid/determinant_1",
         ),
     ),
     piece=50,
     rules=RULE_CHOICES,
     scores=PAIR.scores,
-)
+)  # fmt: skip

@@ -14,22 +14,17 @@ from track_fusion.metrics.accuracy import Estimate
 from track_fusion.metrics.consistency import nees
 from track_fusion.peers import Peer, Round, communicate
 from track_fusion.random_streams import stream
-from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
-from track_fusion.rules.ellipsoidal_intersection import EllipsoidalIntersectionParams
-from track_fusion.rules.harmonic_mean import HarmonicMeanParams
-from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
-from track_fusion.rules.naive import NaiveParams
 from track_fusion.study.chart import Chart, Series, bars, ellipse
 from track_fusion.study.claim import Claim
 from track_fusion.study.rows import Outcomes, Progress, chosen, row_by_row
 from track_fusion.study.rule_choice import RuleChoice, fuse_runs, rule_by_rule
 
 RULE_CHOICES = (
-    RuleChoice("naive", NaiveParams()),
-    RuleChoice("covariance_intersection", CovarianceIntersectionParams(criterion="trace")),
-    RuleChoice("inverse_covariance_intersection", InverseCovarianceIntersectionParams(criterion="trace")),
-    RuleChoice("ellipsoidal_intersection", EllipsoidalIntersectionParams()),
-    RuleChoice("harmonic_mean", HarmonicMeanParams(criterion="trace")),
+    RuleChoice.of("naive"),
+    RuleChoice.of("covariance_intersection", criterion="trace"),
+    RuleChoice.of("inverse_covariance_intersection", criterion="trace"),
+    RuleChoice.of("ellipsoidal_intersection"),
+    RuleChoice.of("harmonic_mean", criterion="trace"),
 )
 #: An assumption of both tests.
 TRACE_WEIGHTS = (

@@ -17,9 +17,7 @@ from track_fusion.random_streams import stream
 from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import network as shared
 from track_fusion.scenarios.sharma.network import RULE_CHOICES, Local, Network, common_claims
-from track_fusion.study.chart import Chart
 from track_fusion.study.claim import Claim
-from track_fusion.study.rows import Outcomes, Progress
 from track_fusion.study.scenario import Scenario
 
 NODES = 10
@@ -64,14 +62,8 @@ READINGS = {
 }
 
 
-def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
-    """Run the rows whose names start with `only`: errors and covariances at S10."""
-    return shared.simulate(READINGS, runs, seed, progress, only)
-
-
-def charts(outcomes: Outcomes) -> list[Chart]:
-    """Fig. 6 for both readings of the measurements."""
-    return shared.charts({"": "S10, (82) as printed", "one_row": "S10, one component each"}, outcomes)
+#: Titles of Fig. 6 for both readings of the measurements.
+TITLES = {"": "S10, (82) as printed", "one_row": "S10, one component each"}
 
 
 def _bloated(text: str, reading: str) -> Claim:
@@ -98,9 +90,9 @@ SCENARIO = Scenario(
         "each node measures the first row of (82) alone",
         "heavily bloated: the trace reported is at least 1.5 times that of the errors",
     ),
-    simulate=simulate,
+    simulate=partial(shared.simulate, READINGS),
     figures=shared.figures,
-    charts=charts,
+    charts=partial(shared.charts, TITLES),
     claims=(
         *common_claims("6.2, Fig. 6"),
         shared.conservative("CI is conservative: NEES / n not above 1.", "6.2", "covariance_intersection"),

@@ -17,9 +17,7 @@ from track_fusion.random_streams import stream
 from track_fusion.scenarios.sharma import PAPER
 from track_fusion.scenarios.sharma import network as shared
 from track_fusion.scenarios.sharma.network import RULE_CHOICES, Local, Network, common_claims
-from track_fusion.study.chart import Chart
 from track_fusion.study.claim import Claim
-from track_fusion.study.rows import Outcomes, Progress
 from track_fusion.study.scenario import Scenario
 from track_fusion.trackers.fusion_loop import filtered
 
@@ -56,16 +54,6 @@ def estimate(runs: Sequence[int], seed: int) -> Local:
 READINGS = {"": Network(estimate, ([(f"S{i}", "S5") for i in range(1, NODES)],), "S5")}
 
 
-def simulate(runs: Sequence[int], seed: int, progress: Progress, only: str = "") -> Outcomes:
-    """Run the rows whose names start with `only`: errors and covariances at S5."""
-    return shared.simulate(READINGS, runs, seed, progress, only)
-
-
-def charts(outcomes: Outcomes) -> list[Chart]:
-    """Fig. 7."""
-    return shared.charts({"": "S5"}, outcomes)
-
-
 def _almost(central: Array, harmonic: Array) -> list[Array]:
     return [ALMOST * central - harmonic]
 
@@ -88,19 +76,15 @@ SCENARIO = Scenario(
         "errors average; at a weight of 0 or 1 the news of S1 would be lost",
         "almost equal: the trace is at most 1.25 times the other",
     ),
-    simulate=simulate,
+    simulate=partial(shared.simulate, READINGS),
     figures=shared.figures,
-    charts=charts,
+    charts=partial(shared.charts, {"": "S5"}),
     claims=(
         *common_claims("6.3, Fig. 7"),
-        Claim(
-            "The actual error of HMD-GA almost equals that of centralised fusion.", "6.3, Fig. 7",
-            ("kf-centralised/sample_trace_1", "kf-harmonic_mean/sample_trace_1"), _almost,
-        ),
-        Claim(
-            "The covariance that HMD-GA reports almost equals that of centralised fusion.", "6.3, Fig. 7",
-            ("kf-centralised/reported_trace_1", "kf-harmonic_mean/reported_trace_1"), _almost,
-        ),
+        Claim("The actual error of HMD-GA almost equals that of centralised fusion.", "6.3, Fig. 7",
+              ("kf-centralised/sample_trace_1", "kf-harmonic_mean/sample_trace_1"), _almost),
+        Claim("The covariance that HMD-GA reports almost equals that of centralised fusion.", "6.3, Fig. 7",
+              ("kf-centralised/reported_trace_1", "kf-harmonic_mean/reported_trace_1"), _almost),
     ),
     piece=2500,
     rules=RULE_CHOICES,

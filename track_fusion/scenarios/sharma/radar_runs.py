@@ -17,12 +17,8 @@ from track_fusion.models.geodetic import LocalFrame
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.rules import RULES
-from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
-from track_fusion.rules.harmonic_mean import HarmonicMeanParams
-from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
-from track_fusion.rules.naive import NaiveParams
 from track_fusion.scenarios.sharma.surveillance import Courses, Radar, Surveillance
-from track_fusion.study.rows import Outcomes, Progress
+from track_fusion.study.rows import Outcomes, Progress, run_by_run
 from track_fusion.study.rule_choice import RuleChoice
 from track_fusion.trackers.many_targets import PdaTracker, PdaTrackerParams
 from track_fusion.tracks import SECOND_NS, TrackBatch, planar_layout
@@ -79,10 +75,10 @@ TRACKER = PdaTrackerParams(
 )
 MANAGER = TrackManagerParams(confirmation_threshold=(2, 3), deletion_threshold=(2, 2), max_coast_s=25.0)
 RULE_CHOICES = (
-    RuleChoice("covariance_intersection", CovarianceIntersectionParams()),
-    RuleChoice("inverse_covariance_intersection", InverseCovarianceIntersectionParams()),
-    RuleChoice("harmonic_mean", HarmonicMeanParams(combine="fold")),
-    RuleChoice("naive", NaiveParams()),
+    RuleChoice.of("covariance_intersection"),
+    RuleChoice.of("inverse_covariance_intersection"),
+    RuleChoice.of("harmonic_mean", combine="fold"),
+    RuleChoice.of("naive"),
 )
 FUSION_TIMES_S: Array = SCAN_S * np.arange(FUSION_SCANS, STEPS + 1, FUSION_SCANS, dtype=np.float64)
 
@@ -192,11 +188,7 @@ def judged_alone(scans: Mapping[int, TrackBatch], truth: Array) -> Judged:
 
 def tracked(rows: Mapping[str, RuleChoice | None], runs: Sequence[int], seed: int, progress: Progress) -> Outcomes:
     """Run rules, and the radars alone (None), on the same tracks of the radars; see :func:`simulate`."""
-    each = [
-        _one_run(rows, seed, run, lambda share, done=done: progress((done + share) / len(runs)))  # type: ignore[misc]
-        for done, run in enumerate(runs)
-    ]
-    return {name: np.stack([one[name] for one in each]) for name in each[0]}
+    return run_by_run(runs, progress, lambda run, tell: _one_run(rows, seed, run, tell))
 
 
 def _one_run(rows: Mapping[str, RuleChoice | None], seed: int, run: int, progress: Progress) -> dict[str, Array]:

@@ -12,9 +12,6 @@ from track_fusion.linalg import Array
 from track_fusion.metrics.accuracy import Estimate, armse
 from track_fusion.random_streams import stream
 from track_fusion.rules import RULES
-from track_fusion.rules.covariance_intersection import CovarianceIntersectionParams
-from track_fusion.rules.harmonic_mean import HarmonicMeanParams
-from track_fusion.rules.inverse_covariance_intersection import InverseCovarianceIntersectionParams
 from track_fusion.scenarios.sharma import PAPER
 from track_fusion.study.chart import Chart, Series, bars
 from track_fusion.study.claim import Claim, within
@@ -40,9 +37,9 @@ class Setting(NamedTuple):
 #: The paper gives neither noise variances nor the correlation.
 SETTINGS = tuple(Setting(q, rho) for q in (0.1, 1.0, 10.0) for rho in (-0.5, 0.0, 0.5))
 RULE_CHOICES = (
-    RuleChoice("covariance_intersection", CovarianceIntersectionParams()),
-    RuleChoice("inverse_covariance_intersection", InverseCovarianceIntersectionParams()),
-    RuleChoice("harmonic_mean", HarmonicMeanParams()),
+    RuleChoice.of("covariance_intersection"),
+    RuleChoice.of("inverse_covariance_intersection"),
+    RuleChoice.of("harmonic_mean"),
 )
 
 
@@ -59,7 +56,7 @@ class Pair:
 PAIRS = {
     "given-harmonic_mean@ratio10_rho0_9": Pair((1.0, 10.0), 0.9, RULE_CHOICES[-1]),
     "given-harmonic_mean@half_ratio10_rho0_99": Pair(
-        (1.0, 10.0), 0.99, RuleChoice("harmonic_mean", HarmonicMeanParams(criterion="given", weights=(0.5, 0.5)))
+        (1.0, 10.0), 0.99, RuleChoice.of("harmonic_mean", criterion="given", weights=(0.5, 0.5))
     ),
 }
 #: Pairs drawn in each run.
@@ -245,37 +242,23 @@ CLAIMS = (
     Claim.below(
         "The weight of CI is always 0.", "6.1, Fig. 3", TIE, *_names("covariance_intersection", "weight_1")
     ),
-    Claim.above(
-        "The weight of ICI is always 1.", "6.1, Fig. 3", 1.0 - TIE,
-        *_names("inverse_covariance_intersection", "weight_1"),
-    ),
-    Claim.each(
-        "CI gives the measurement itself.", "6.1",
-        _names("covariance_intersection", "armse_1"), _names("alone", "armse_1"), _same,
-    ),
-    Claim.each(
-        "ICI gives the measurement itself.", "6.1",
-        _names("inverse_covariance_intersection", "armse_1"), _names("alone", "armse_1"), _same,
-    ),
-    Claim(
-        "The weight of HMD-GA is 0.2 on average: within 0.05 somewhere on the grid.", "6.1, Fig. 3",
-        _names("harmonic_mean", "weight_1"), _somewhere_a_fifth,
-    ),
-    Claim(
-        "HMD-GA gives the measurement more weight than the prior: everywhere on the grid.", "6.1",
-        _names("harmonic_mean", "weight_1"), lambda *weights: [m for w in weights for m in (w, 0.5 - w)],
-    ),
+    Claim.above("The weight of ICI is always 1.", "6.1, Fig. 3",
+                1.0 - TIE, *_names("inverse_covariance_intersection", "weight_1")),
+    Claim.each("CI gives the measurement itself.", "6.1",
+               _names("covariance_intersection", "armse_1"), _names("alone", "armse_1"), _same),
+    Claim.each("ICI gives the measurement itself.", "6.1",
+               _names("inverse_covariance_intersection", "armse_1"), _names("alone", "armse_1"), _same),
+    Claim("The weight of HMD-GA is 0.2 on average: within 0.05 somewhere on the grid.", "6.1, Fig. 3",
+          _names("harmonic_mean", "weight_1"), _somewhere_a_fifth),
+    Claim("HMD-GA gives the measurement more weight than the prior: everywhere on the grid.", "6.1",
+          _names("harmonic_mean", "weight_1"), lambda *weights: [m for w in weights for m in (w, 0.5 - w)]),
     Claim.below(
         "HMD-GA is consistent: in this problem, everywhere on the grid.", "7", 1.0, *_names("harmonic_mean", "nees_1")
     ),
-    Claim.below(
-        "HMD-GA is consistent: variances 1 and 10, correlation 0.9, weights by (77).", "4.2, 7", 1.0,
-        "given-harmonic_mean@ratio10_rho0_9/nees_1",
-    ),
-    Claim.below(
-        "HMD-GA is consistent near perfect correlation: variances 1 and 10, correlation 0.99, weights 1/2.", "4.2",
-        1.0, "given-harmonic_mean@half_ratio10_rho0_99/nees_1",
-    ),
+    Claim.below("HMD-GA is consistent: variances 1 and 10, correlation 0.9, weights by (77).", "4.2, 7",
+                1.0, "given-harmonic_mean@ratio10_rho0_9/nees_1"),
+    Claim.below("HMD-GA is consistent near perfect correlation: variances 1 and 10, correlation 0.99, weights 1/2.",
+                "4.2", 1.0, "given-harmonic_mean@half_ratio10_rho0_99/nees_1"),
 )  # fmt: skip
 
 SCENARIO = Scenario(
