@@ -16,6 +16,7 @@ from track_fusion.centre.config import (
     SourceConfig,
     TrackManagerParams,
 )
+from track_fusion.centre.history import History
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
 from track_fusion.params import ParameterError
@@ -263,7 +264,7 @@ def test_a_scan_used_before_starts_nothing():
     )
     fuser.step(0, {0: tracks([[0, 0]], 0)})
     none = fuser.state.central[np.zeros(1, bool)]  # as if the track had been deleted
-    fuser.state = dataclasses.replace(fuser.state, central=none)
+    fuser.history = History.of(dataclasses.replace(fuser.state, central=none))
     fused, _ = fuser.step(SECOND, {})
     assert len(fused) == 0
 
@@ -271,7 +272,8 @@ def test_a_scan_used_before_starts_nothing():
 def test_a_scan_used_before_uses_up_no_identifier():
     fuser = centre(1, max_scan_age_s=10.0)
     fuser.step(0, {0: tracks([[0, 0]], 0)})
-    fuser.state = dataclasses.replace(fuser.state, central=fuser.state.central[np.zeros(1, bool)])
+    none = fuser.state.central[np.zeros(1, bool)]
+    fuser.history = History.of(dataclasses.replace(fuser.state, central=none))
     _, info = fuser.step(SECOND, {})
     assert info.changes.born.tolist() == info.changes.deleted.tolist() == []
     assert fuser.step(2 * SECOND, {0: tracks([[0, 0]], 2 * SECOND)})[0].track_id.tolist() == [2]

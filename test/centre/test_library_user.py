@@ -162,10 +162,10 @@ def test_a_result_is_made_when_it_is_asked_for():
 def test_what_was_kept_can_be_set_again():
     own, kept, results = fusion_centre(trigger="any_source"), [], []
     for k in range(1, 6):
-        kept.append((own.state, own.buffer))
+        kept.append((own.history, own.buffer))
         own.receive(k % 2, scan(k * SECOND, k), k * SECOND, k * SECOND)
         results += own.advance(k * SECOND)
-    own.state, own.buffer = kept[2]
+    own.history, own.buffer = kept[2]
     for k in range(3, 6):
         own.receive(k % 2, scan(k * SECOND, k), k * SECOND, k * SECOND)
         (again,) = own.advance(k * SECOND)

@@ -179,6 +179,23 @@ def _joined(queue: Queue, scan: Waiting, piece: Waiting) -> tuple[Queue, str | N
     return dataclasses.replace(queue, waiting=waiting), reason
 
 
+def predicted(config: CentreConfig, step: Step) -> Step:
+    """Take the late scans of a step as new ones: the newest of each source that brings no other, if not too old."""
+    scans, kept_out = dict(step.scans), Counter(step.kept_out)
+    for source, scan, stamp_ns in sorted(step.late, key=lambda late: late[2], reverse=True):
+        if source in scans:
+            kept_out["superseded_scan"] += 1
+        elif _is_aged(config, step.time_ns, stamp_ns):
+            kept_out["aged_scan"] += 1
+        else:
+            scans[source] = scan
+    return step._replace(scans=scans, kept_out=kept_out, late=())
+
+
+def _is_aged(config: CentreConfig, time_ns: int, stamp_ns: int) -> bool:
+    return time_ns - stamp_ns > config.params.max_scan_age_s * SECOND_NS
+
+
 def advance(config: CentreConfig, buffer: ScanBuffer, now_ns: int, living: bool) -> tuple[ScanBuffer, Step | None]:
     """Return the next step that may run, or None; the times of steps strictly increase.
 
@@ -311,7 +328,7 @@ def _taken(config: CentreConfig, buffer: ScanBuffer, time_ns: int, now_ns: int) 
         late += [(k, w.scan, w.stamp_ns) for w in due if w.stamp_ns <= past_ns]
         new = [w for w in due if w.stamp_ns > past_ns]
         kept_out["superseded_scan"] += max(len(new) - 1, 0)
-        if new and time_ns - new[-1].stamp_ns > config.params.max_scan_age_s * SECOND_NS:
+        if new and _is_aged(config, time_ns, new[-1].stamp_ns):
             kept_out["aged_scan"] += 1
         elif new:
             scans[k] = new[-1].scan

@@ -3,27 +3,40 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 from track_fusion.centre import buffer
-from track_fusion.centre.buffer import ScanBuffer
+from track_fusion.centre.buffer import ScanBuffer, Step
 from track_fusion.centre.config import CentreConfig
+from track_fusion.centre.history import History, Late, Rewound, forward, rewind
 from track_fusion.centre.pool import predicted_to
 from track_fusion.centre.publish import StepInfo
 from track_fusion.centre.state import CentreState
-from track_fusion.centre.step import step
-from track_fusion.tracks import TrackBatch
+from track_fusion.tracks import SECOND_NS, TrackBatch
 
 
 class Published(NamedTuple):
-    """The outcome of a step: the tracks to publish and their time, what happened, scans kept out by reason."""
+    """The outcome of a step.
+
+    Attributes
+    ----------
+    time_ns : int
+    tracks : TrackBatch         to be published, at that time
+    info : StepInfo             what happened
+    kept_out : Counter          scans that took no part, by reason
+    rewound : Rewound or None   what was repeated before the step for scans that came late
+    beyond_share : int          late scans that were predicted instead, `max_rewind_share` being used up
+    """
 
     time_ns: int
     tracks: TrackBatch
     info: StepInfo
     kept_out: Counter[str]
+    rewound: Rewound | None = None
+    beyond_share: int = 0
 
 
 class FusionCentre:
@@ -34,31 +47,43 @@ class FusionCentre:
 
     doc/fusion-centre.md has an example.
 
+    Parameters
+    ----------
+    config : CentreConfig
+    timer : function    seconds, of any zero: how long repeating steps takes (`max_rewind_share`)
+
     Attributes
     ----------
     config : CentreConfig
-    state : CentreState      a value: keep it, and set it again to go back
+    history : History        a value: keep it, and set it again to go back; holds the state, and the last steps where
+                             late scans make the centre repeat them
     buffer : ScanBuffer      likewise
     resets : int             how often the clock was seen to step back further than is ridden out
     """
 
-    def __init__(self, config: CentreConfig) -> None:
-        self.config, self.resets = config, 0
-        self.state, self.buffer = CentreState.initial(config), ScanBuffer.empty(config)
+    def __init__(self, config: CentreConfig, timer: Callable[[], float] = time.perf_counter) -> None:
+        self.config, self.resets, self._timer = config, 0, timer
+        self.history, self.buffer = History.of(CentreState.initial(config)), ScanBuffer.empty(config)
+        self._allowance_s, self._told_ns = self._most_s, -1
 
     def reset(self) -> None:
         """Forget all tracks and scans; identities go on, so that none is given again."""
-        given = self.state.central.identities
-        self.state, self.buffer = CentreState.initial(self.config, given), ScanBuffer.empty(self.config)
+        given = self.state.central.identities._replace(births=self.history.next_id)
+        self.history, self.buffer = History.of(CentreState.initial(self.config, given)), ScanBuffer.empty(self.config)
+
+    @property
+    def state(self) -> CentreState:
+        """What the next step begins with; tracks are numbered in it as if all scans had come in time."""
+        return self.history.present.state
 
     @property
     def tracks(self) -> TrackBatch:
         """All living central tracks, tentative ones included."""
-        return self.state.central.tracks
+        return self.history.present.known(self.state.central.tracks)
 
     def step(self, time_ns: int, scans: Mapping[int, TrackBatch]) -> tuple[TrackBatch, StepInfo]:
         """Fuse at one time; see :func:`track_fusion.centre.step.step`."""
-        self.state, published, info = step(self.config, self.state, time_ns, scans)
+        self.history, published, info = forward(self.config, self.history, time_ns, scans)
         self.buffer = dataclasses.replace(self.buffer, fused_ns=time_ns)
         return published, info
 
@@ -77,11 +102,36 @@ class FusionCentre:
         """Run the steps that are due by now, one whenever the next result is asked for."""
         self._heed(now_ns)
         while True:
-            self.buffer, due = buffer.advance(self.config, self.buffer, now_ns, living=len(self.tracks) > 0)
+            living = len(self.state.central) > 0
+            self.buffer, due = buffer.advance(self.config, self.buffer, now_ns, living)
             if due is None:
                 return
-            tracks, info = self.step(due.time_ns, due.scans)
-            yield Published(due.publish_ns, self._shown(tracks, due.publish_ns), info, due.kept_out)
+            rewound = self._rewound(due, now_ns) if due.late else None
+            beyond_share = 0 if rewound else len(due.late)
+            own = buffer.predicted(self.config, due) if beyond_share else due
+            kept_out = own.kept_out + rewound.kept_out if rewound else own.kept_out
+            tracks, info = self.step(own.time_ns, own.scans)
+            tracks = self._shown(tracks, own.publish_ns)
+            yield Published(own.publish_ns, tracks, info, kept_out, rewound, beyond_share)
+
+    @property
+    def _most_s(self) -> float:
+        return self.config.buffer.max_rewind_share * self.config.buffer.history_length_s
+
+    def _rewound(self, due: Step, now_ns: int) -> Rewound | None:
+        """Repeat steps for late scans, if the share of the time that this may take allows it."""
+        share = self.config.buffer.max_rewind_share
+        if self._told_ns >= 0:
+            passed_s = max(now_ns - self._told_ns, 0) / SECOND_NS
+            self._allowance_s = min(self._allowance_s + share * passed_s, self._most_s)
+        self._told_ns = now_ns
+        if share < 1.0 and self._allowance_s <= 0.0:
+            return None
+        began_s = self._timer()
+        late = (Late(source, scan, stamp_ns) for source, scan, stamp_ns in due.late)
+        self.history, rewound = rewind(self.config, self.history, late)
+        self._allowance_s -= self._timer() - began_s
+        return rewound
 
     def wake_ns(self, now_ns: int) -> int | None:
         """Return when to call `advance` even if no scan comes; see :func:`track_fusion.centre.buffer.wake_ns`."""

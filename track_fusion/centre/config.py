@@ -138,8 +138,22 @@ class ScanBufferParams(Params):
     max_delay_s: float = param(10.0, "a scan older than this on arrival is rejected", unit="s", low=0.0, strict=True)
     out_of_sequence: str = param(
         "predict",
-        "a scan older than the last step: neglect it, or predict it to the next one as its source's newest",
-        choices=("neglect", "predict"),
+        "a scan that is no later than the last step: neglect it; predict it to the next one as its source's newest; or "
+        "retrodict: repeat the steps since its stamp (needs memory: true)",
+        choices=("neglect", "predict", "retrodict"),
+    )
+    history_length_s: float = param(
+        2.0, "retrodict: how far back steps can be repeated; an older scan is kept out", unit="s", low=0.0, strict=True
+    )
+    history_megabytes: float = param(
+        100.0, "retrodict: what is kept for that, about; the oldest steps are dropped", unit="MB", low=0.0, strict=True
+    )
+    max_rewind_share: float = param(
+        0.3,
+        "retrodict: share of the time that repeating may take; scans beyond it are predicted, and counted. 1: no limit",
+        low=0.0,
+        high=1.0,
+        strict=True,
     )
 
 
@@ -256,8 +270,8 @@ class CentreConfig:
     ------
     ParameterError    too many sources; the rule needs what source tracks do not bring, such as their
                       cross-covariance; `confirmation_sources` exceeds them; weights are given that do not fit the
-                      sources; not one number an axis in
-                      `particle_variances`; a transform does not bring every axis of the centre
+                      sources; not one number an axis in `particle_variances`; retrodiction without memory; a transform
+                      does not bring every axis of the centre
     """
 
     sources: tuple[SourceConfig, ...]
@@ -290,6 +304,11 @@ class CentreConfig:
             raise ParameterError(
                 f"The 'particle_variances' parameter must hold {self.layout.size} numbers, one an axis, or none. "
                 f"Got {len(self.params.particle_variances)}."
+            )
+        if self.retrodicts and not self.params.memory:
+            raise ParameterError(
+                "The 'out_of_sequence' parameter must be 'neglect' or 'predict' where 'memory' is false: each source's "
+                "newest scan alone counts then, so that a late one would change nothing but the past. Got 'retrodict'."
             )
         if len(self.weights) or getattr(self.rule_params, "criterion", "") == "given":
             self._try_weights()
@@ -351,6 +370,11 @@ class CentreConfig:
         every = np.ones(self.layout.size, bool)
         rows = [every if s.transform is None else s.transform.brings for s in self.sources]
         return np.array(rows, bool).reshape(-1, self.layout.size)
+
+    @property
+    def retrodicts(self) -> bool:
+        """Whether a late scan makes the centre repeat its last steps."""
+        return self.buffer.out_of_sequence == "retrodict"
 
     @cached_property
     def can_initiate(self) -> NDArray[np.bool_]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 import uuid
+from collections.abc import Collection
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -54,6 +56,15 @@ class Identities(NamedTuple):
         Identities     what has been given then
         """
         numbers = range(self.births, self.births + count)
-        names = b"".join(uuid.uuid5(self.namespace, str(number)).bytes for number in numbers)
-        uuids = np.frombuffer(names, np.uint8).reshape(count, UUID_BYTES)
-        return np.fromiter(numbers, np.int64, count) % _IDS, uuids, self._replace(births=self.births + count)
+        ids = np.fromiter(numbers, np.int64, count) % _IDS
+        return ids, self.uuids(numbers), self._replace(births=self.births + count)
+
+    def uuids(self, numbers: Collection[int]) -> NDArray[np.uint8]:
+        """Return the UUIDs of births, (N, 16): version 5, of the namespace and the number."""
+        names = b"".join(_uuid(self.namespace, number) for number in numbers)
+        return np.frombuffer(names, np.uint8).reshape(len(numbers), UUID_BYTES)
+
+
+@lru_cache(maxsize=4096)
+def _uuid(namespace: uuid.UUID, number: int) -> bytes:
+    return uuid.uuid5(namespace, str(number)).bytes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,25 @@ from track_fusion.centre.config import FusionCentreParams
 from track_fusion.centre.fuse import Fused
 from track_fusion.centre.manage import Changes
 from track_fusion.centre.pool import Pool
+from track_fusion.centre.state import CentralTracks
 from track_fusion.tracks import TrackBatch
+
+
+class Fed(NamedTuple):
+    """Which source track went into which central track, M of them, in the order of the sources.
+
+    Attributes
+    ----------
+    source : (M,)      index of the source
+    track_id : (M,)    identifier that the source gave it
+    stamp_ns : (M,)    stamp of its scan
+    central : (M,)     identifier of the central track
+    """
+
+    source: NDArray[np.intp]
+    track_id: NDArray[np.int64]
+    stamp_ns: NDArray[np.int64]
+    central: NDArray[np.int64]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,6 +42,7 @@ class StepInfo:
     ----------
     members : (S,) int          source tracks that took part, by source
     changes : Changes           births, confirmations, deletions
+    fed : Fed                   the same source tracks, one by one
     shared_provenance : int     members that already hold another one's information: source tracks that say so, and
                                 with memory each central track that was fused with new ones
     unconverged : int           fusions whose weights did not converge
@@ -35,6 +55,7 @@ class StepInfo:
 
     members: NDArray[np.intp]
     changes: Changes
+    fed: Fed
     shared_provenance: int
     unconverged: int
     unsound: int
@@ -50,14 +71,17 @@ def publish(params: FusionCentreParams, tracks: TrackBatch) -> TrackBatch:
 
 
 def told(
-    sources: int, pool: Pool, association: Association, fused: Fused, changes: Changes, merged: NDArray[np.int64]
-) -> StepInfo:
-    """Sum up a step of a centre of so many sources."""
-    member = association.member
+    pool: Pool, association: Association, fused: Fused, before: CentralTracks, changes: Changes,
+    merged: NDArray[np.int64],
+) -> StepInfo:  # fmt: skip
+    """Sum up a step."""
+    member, sources = association.member, before.history.shape[1]
+    ids = np.concatenate([before.tracks.track_id, changes.born])[association.target]
+    fed = Fed(pool.source[member], pool.tracks.track_id[member], pool.stamp_ns[member], ids)
     foreign = int(np.count_nonzero(pool.tracks.source[member] & ~pool.bit[member]))
     taken = np.bincount(pool.source[member], minlength=sources)
     shared = foreign + len(association.remembered)
     return StepInfo(
-        taken, changes, shared, fused.unconverged, fused.unsound, fused.beyond, association.held, association.released,
-        merged,
+        taken, changes, fed, shared, fused.unconverged, fused.unsound, fused.beyond, association.held,
+        association.released, merged,
     )  # fmt: skip

@@ -58,7 +58,7 @@ def step(
     linked = dataclasses.replace(before, links=association.links)
     central, changes = manage(config.manager, linked, fused, member, fresh, supported_ns, stamps)
     central, merged = merge(config, central)
-    info = told(sources, pool, association, fused, changes, merged)
+    info = told(pool, association, fused, before, changes, merged)
     return CentreState(central, newest, stamps, random, time_ns), publish(config.params, central.tracks), info
 
 

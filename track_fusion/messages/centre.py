@@ -221,4 +221,9 @@ class MessageCentre:
             counted["deleted"] += len(info.changes.deleted)
             counted["dropped_tentative"] += len(info.changes.dropped)
             counted["merged"] += len(info.merged)
+            counted["late_beyond_share"] += result.beyond_share
+            if result.rewound:
+                counted["rewinds"] += result.rewound.repeated > 0
+                counted["repeated_steps"] += result.rewound.repeated
+                counted["vanished"] += len(result.rewound.vanished)
             yield result
