@@ -198,7 +198,6 @@ def relink(source, rows, pairs, d2, tracks, is_new, settings):
     held, shares = set(), settings.merge_duplicates == "also_within_a_source"
     index = {row["track_id"]: i for i, row in enumerate(rows)}
     for j, track in enumerate(tracks):
-        taken = j in pairs.values()
         for own, track_id in [link for link in track["links"] if link[0] == source]:
             i = index.get(track_id)
             if i is not None and i in pairs:
@@ -206,8 +205,6 @@ def relink(source, rows, pairs, d2, tracks, is_new, settings):
             elif shares and (i, j) in d2:
                 track["links"][own, track_id] = 0
                 held.add(i)
-            elif taken and i is not None:
-                del track["links"][own, track_id]
             else:
                 track["links"][own, track_id] += is_new
                 if track["links"][own, track_id] > settings.patience:

@@ -110,19 +110,16 @@ def _held(
 ) -> tuple[Bools, Ints, int]:
     """Tell which source tracks without target are held out, (P,), the idle updates of all, and how many are released.
 
-    Held out is who feeds a central track and lies too far from it, until his patience is over, unless another track
-    of his source has taken his place; where tracks may share one, also who lies within reach.
+    Held out is who feeds a central track and lies too far from it, or whose place another track of his source has
+    taken, until his patience is over; where tracks may share one, also who lies within reach.
     """
     out = (target < 0) & (linked >= 0)
     if not out.any():
         return out, np.zeros(len(target), np.int64), 0
-    feeds, new = pool.source + len(config.sources) * linked, fresh[pool.source]
-    taken = (pool.source + len(config.sources) * target)[target >= 0]
-    waits = out & ~np.isin(feeds, taken)
     spare = out & inside if _shares(config) else np.zeros(len(out), bool)
-    idle = np.where((target >= 0) | spare, 0, idle + (waits & new))
-    held = spare | (waits & (idle <= config.params.patience))
-    return held, idle, int(np.count_nonzero(waits & ~held))
+    idle = np.where(out & ~spare, idle + fresh[pool.source], 0)
+    held = spare | (out & (idle <= config.params.patience))
+    return held, idle, int(np.count_nonzero(out & ~held))
 
 
 def _start(config: CentreConfig, pool: Pool, target: Rows, held: Bools, fresh: Bools) -> int:
