@@ -124,8 +124,7 @@ def add(
     queue = buffer.queues[source]
     reason = _refusal(config.buffer, buffer, queue, stamp_ns, now_ns)
     if reason is None:
-        assembles = config.sources[source].assembles
-        queue, reason = _taken_in(assembles, queue, Waiting(stamp_ns, now_ns, now_ns, scan))
+        queue, reason = _taken_in(config, source, queue, Waiting(stamp_ns, now_ns, now_ns, scan))
     most = config.sources[source].settings.max_tracks_per_scan
     if reason is None and any(len(waiting.scan) > most for waiting in queue.waiting):
         return buffer, "too_many_tracks"
@@ -148,14 +147,16 @@ def _refusal(params: ScanBufferParams, buffer: ScanBuffer, queue: Queue, stamp_n
     return "late_scan" if params.out_of_sequence == "neglect" else None
 
 
-def _taken_in(assembles: bool, queue: Queue, new: Waiting) -> tuple[Queue, str | None]:
+def _taken_in(config: CentreConfig, source: int, queue: Queue, new: Waiting) -> tuple[Queue, str | None]:
     """Sort a scan in, or put a piece to the scan whose stamp it bears."""
+    assembles = config.sources[source].assembles
     ids = frozenset(new.scan.track_id.tolist()) if assembles else frozenset[int]()
     newest = queue.stamps[-1] if queue.stamps else -1
     if new.stamp_ns == newest:
         queue = dataclasses.replace(queue, ids=queue.ids | ids)
     same = next((w for w in queue.waiting if w.stamp_ns == new.stamp_ns), None)
-    if same is None and new.stamp_ns == queue.taken_ns:
+    joins_what_was_taken = assembles and config.retrodicts
+    if same is None and new.stamp_ns == queue.taken_ns and not joins_what_was_taken:
         return queue, "late_scan" if assembles else "duplicate_scan"
     if same is not None and not assembles:
         return queue, "duplicate_scan"

@@ -372,6 +372,11 @@ class CentreConfig:
         return np.array(rows, bool).reshape(-1, self.layout.size)
 
     @property
+    def joins_scans(self) -> bool:
+        """Whether a step may take up scans of stamps before its own."""
+        return self.buffer.trigger == "rate" or self.buffer.max_output_rate_hz > 0
+
+    @property
     def retrodicts(self) -> bool:
         """Whether a late scan makes the centre repeat its last steps."""
         return self.buffer.out_of_sequence == "retrodict"

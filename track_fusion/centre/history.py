@@ -205,8 +205,9 @@ def _stepped(
 
 
 def _exchanged(words: Ids, meanings: Ids, ids: Ids) -> Ids:
-    """Exchange identifiers, each one of the words, which ascend, for their meanings."""
-    meant = np.asarray(meanings[np.searchsorted(words, ids)])
+    """Exchange identifiers, each one of the words, for their meanings."""
+    order = np.argsort(words, kind="stable")
+    meant = np.asarray(meanings[order[np.searchsorted(words, ids, sorter=order)]])
     meant.setflags(write=False)
     return meant
 
@@ -236,7 +237,7 @@ def _placed(config: CentreConfig, history: History, late: Iterable[Late]) -> tup
         if scan.stamp_ns <= history.begin_ns:
             kept_out["older_than_history"] += 1
             continue
-        at = _its_step(steps, scan)
+        at = _its_step(config, steps, scan)
         scans, reason = _with(config.sources[scan.source].assembles, steps[at].scans, scan)
         kept_out.update([reason] if reason else [])
         if scans is not None:
@@ -249,8 +250,8 @@ def _time_ns(kept: Kept) -> int:
     return kept.time_ns
 
 
-def _its_step(steps: list[Kept], late: Late) -> int:
-    """Return the index of the step of a late scan, a new one where none is at its stamp.
+def _its_step(config: CentreConfig, steps: list[Kept], late: Late) -> int:
+    """Return the index of the step of a late scan: one at its stamp, or the next one where steps join scans.
 
     The step that took a scan of the same stamp is the one: it tells repeated scans, and pieces of one.
     """
@@ -259,7 +260,7 @@ def _its_step(steps: list[Kept], late: Late) -> int:
         if taken is not None and taken.stamp_ns == late.stamp_ns:
             return at
     at = bisect_left(steps, late.stamp_ns, key=_time_ns)
-    if steps[at].time_ns != late.stamp_ns:
+    if steps[at].time_ns != late.stamp_ns and not config.joins_scans:
         steps.insert(at, Kept(steps[at].before, late.stamp_ns, {}, {}))
     return at
 
