@@ -10,7 +10,17 @@ from collections.abc import Iterable
 from benchmark.measure import Result
 
 #: Every benchmark module, by name, in the order of running: each has `run()`, which yields results.
-MODULES = ("rules", "elliptical", "mixture", "association", "monte_carlo", "wire", "lockstep", "latency")
+MODULES = (
+    "rules",
+    "elliptical",
+    "mixture",
+    "association",
+    "retrodiction",
+    "monte_carlo",
+    "wire",
+    "lockstep",
+    "latency",
+)
 
 try:
     from rich.console import Console

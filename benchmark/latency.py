@@ -92,6 +92,7 @@ def run() -> Iterator[Result]:
     params = {
         "process_noise": 1.0,
         "confirmation_threshold": [1, 1],
+        "trigger": "all_sources",
         "fusion_timeout_s": 10.0,
         "source_timeout_s": 60.0,
     }

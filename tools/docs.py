@@ -215,6 +215,7 @@ def fusion_centre_sections() -> list[Section]:
         StateFusionParams,
         TrackManagerParams,
     )
+    from track_fusion.clock import ClockParams
     from track_fusion.models.choices import MOTIONS, MotionChoice
     from track_fusion.nodes.fusion_centre import SourceParams
     from track_fusion.nodes.managed import ManagedParams
@@ -233,12 +234,14 @@ def fusion_centre_sections() -> list[Section]:
         ),
         *map(Section, (ScanBufferParams, TrackManagerParams)),
         Section(RandomParams, title="Random numbers of rules that draw samples: seed, run and role name a stream."),
+        Section(ClockParams),
         Section(ManagedParams),
     ]
 
 
 def sensor_tracker_sections() -> list[Section]:
     """List what a sensor tracker declares; a test compares it with the node."""
+    from track_fusion.clock import ClockParams
     from track_fusion.models.choices import MOTIONS, SENSORS, Choice
     from track_fusion.nodes.managed import ManagedParams
     from track_fusion.nodes.screening import FrameParams
@@ -254,7 +257,7 @@ def sensor_tracker_sections() -> list[Section]:
         *_alternatives("motion", MOTIONS.own, default.motion),
         *_alternatives("sensor", SENSORS, default.sensor),
         *_alternatives("filter", filters, default.filter),
-        *map(Section, (SensorTrackerParams, FeedbackParams, OutputParams, ManagedParams)),
+        *map(Section, (SensorTrackerParams, FeedbackParams, OutputParams, ClockParams, ManagedParams)),
     ]
 
 

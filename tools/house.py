@@ -39,7 +39,7 @@ FLOORS: tuple[Mapping[str, str], ...] = (
     {"ground": "modules outside any folder: data model, parameters, linear algebra, angles, random streams"},
 )
 #: The modules that stand on the ground, outside any folder, and the package itself.
-GROUND = frozenset({"", "angles", "layouts", "linalg", "params", "plugins", "random_streams", "tracks"})
+GROUND = frozenset({"", "angles", "clock", "layouts", "linalg", "params", "plugins", "random_streams", "tracks"})
 #: Only these rooms know ROS.
 ROS_ROOMS = frozenset({"demo", "nodes"})
 #: The adapters stand beside the house: these rooms use them, they know nothing of it.

@@ -26,6 +26,8 @@ MAX_COAST_S, LOOK_NS = 3.0, 20 * MS
 
 
 def fusion_centre(**buffer):
+    """A centre that waits for all sources, unless told otherwise."""
+    buffer = {"trigger": "all_sources"} | buffer
     rule, motion = RULES["covariance_intersection"], NearlyConstantVelocity(LAYOUT, MotionParams(process_noise=5.0))
     manager = TrackManagerParams(confirmation_threshold=(1, 1), max_coast_s=MAX_COAST_S)
     sources, params = (SourceConfig("a"), SourceConfig("b")), FusionCentreParams(max_scan_age_s=0.3)
@@ -72,19 +74,76 @@ def test_scans_that_are_turned_away_and_superseded_are_told():
     own = fusion_centre(fusion_timeout_s=0.05)
     assert own.receive(0, scan(100 * MS), 100 * MS, 100 * MS) is None
     assert own.receive(0, scan(100 * MS), 100 * MS, 101 * MS) == "duplicate_scan"
-    assert [p.superseded for p in own.advance(150 * MS)] == [{}]
+    assert [p.kept_out for p in own.advance(150 * MS)] == [{}]
     for stamp in (90, 95, 100):
         assert own.receive(1, scan(stamp * MS), stamp * MS, 160 * MS) is None
-    (result,) = own.advance(160 * MS)
-    assert (result.time_ns, result.superseded) == (100 * MS, {"superseded_scan": 2})
+    (result,) = own.advance(210 * MS)
+    assert (result.time_ns, result.kept_out) == (100 * MS + 1, {"superseded_scan": 2})
 
 
 def test_a_step_of_ones_own_counts_for_the_buffer():
     own = fusion_centre(trigger="any_source")
     own.step(SECOND, {0: scan(SECOND)})
     own.receive(1, scan(900 * MS), 900 * MS, SECOND)
-    (result,) = own.advance(SECOND)
-    assert (result.time_ns, result.tracks.source.tolist()) == (SECOND, [3])
+    assert list(own.advance(SECOND)) == []
+    assert own.wake_ns(SECOND + 50 * MS) == SECOND + 100 * MS
+    (result,) = own.advance(SECOND + 100 * MS)
+    assert (result.time_ns, result.tracks.source.tolist()) == (SECOND + 1, [3])
+
+
+def test_a_second_centre_behind_the_first_loses_nothing():
+    """Two sources of 10 and 30 Hz, each late by its own delay, the slow one sometimes by more than a period."""
+    first, second, arrivals = fusion_centre(trigger="any_source"), fusion_centre(trigger="any_source"), []
+    for k in range(90):
+        stamp = SECOND + k * SECOND // 30
+        arrivals.append((stamp + 3 * MS, 1, stamp))
+        if k % 3 == 0:
+            arrivals.append((stamp + (45 if k % 2 else 2) * MS, 0, stamp))
+    published, taken = [], []
+    for now, source, stamp in sorted(arrivals):
+        assert first.receive(source, scan(stamp), stamp, now) is None
+        for result in first.advance(now):
+            published.append(result)
+            assert second.receive(0, result.tracks, result.time_ns, now) is None
+            taken += second.advance(now)
+    published += first.advance(5 * SECOND)
+    assert len(published) > 85
+    assert [p.time_ns for p in taken] == [p.time_ns for p in published[: len(taken)]]
+    assert all(not p.kept_out for p in taken)
+    assert all(np.diff([p.time_ns for p in published]) > 0)
+
+
+def test_what_is_published_at_the_time_of_the_clock_is_predicted_to_it():
+    own, at_stamp = fusion_centre(trigger="any_source", publish_at="now"), fusion_centre(trigger="any_source")
+    for centre in (own, at_stamp):
+        centre.receive(0, scan(SECOND, 7.0), SECOND, SECOND + 50 * MS)
+    (now,), (then,) = own.advance(SECOND + 50 * MS), at_stamp.advance(SECOND + 50 * MS)
+    assert (now.time_ns, then.time_ns) == (SECOND + 50 * MS, SECOND)
+    assert now.tracks.time_ns.tolist() == [SECOND + 50 * MS]
+    np.testing.assert_allclose(now.tracks.mean[0, 0], [7.05, 0.0, 1.0, 0.0])
+    np.testing.assert_allclose(now.tracks.cov[0, 0, 0, 0], 1 + 0.05**2 + 5.0 * 0.05**3 / 3)
+    np.testing.assert_array_equal(own.tracks.mean, at_stamp.tracks.mean)  # the state stays at its own time
+
+
+def test_a_small_backward_step_of_the_clock_is_ridden_out():
+    own, published = fusion_centre(trigger="any_source"), []
+    for k in range(40):
+        now = SECOND + k * 10 * MS - (25 * MS if k >= 20 else 0)
+        assert own.receive(k % 2, scan(now), now, now) in (None, "duplicate_scan", "out_of_order_scan")
+        published += own.advance(now)
+    assert own.resets == 0
+    assert {i for p in published for i in p.tracks.track_id.tolist()} == {1}
+    assert published[-1].time_ns == SECOND + 365 * MS
+
+
+def test_a_large_one_starts_anew_and_identifiers_go_on_counting():
+    own = fusion_centre(trigger="any_source")
+    for now, resets, ids in [(5 * SECOND, 0, [1]), (5 * SECOND - 101 * MS, 1, [2]), (SECOND, 2, [3])]:
+        assert own.receive(0, scan(now), now, now) is None
+        (result,) = own.advance(now)
+        assert (own.resets, result.tracks.track_id.tolist(), result.time_ns) == (resets, ids, now)
+    own.reset()
+    assert (own.resets, own.state.central.next_id, own.buffer.silence_s(0, SECOND)) == (2, 4, -1.0)
 
 
 def test_a_result_is_made_when_it_is_asked_for():

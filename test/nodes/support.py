@@ -27,6 +27,7 @@ STEP_S = 60.0  # far above what anything awaited here takes, on a busy machine t
 PATIENT = {
     "use_sim_time": True,
     "axes": list(AXES),
+    "trigger": "all_sources",
     "fusion_timeout_s": 1000.0,
     "source_timeout_s": 10_000.0,
     "max_delay_s": 1000.0,

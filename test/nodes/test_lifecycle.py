@@ -304,6 +304,7 @@ CENTRE = {
     "axes": list(AXES),
     "state_fusion": "covariance_intersection",
     "process_noise": 5.0,
+    "trigger": "all_sources",
     "fusion_timeout_s": 2.5,
     "source_timeout_s": 5.0,
     "max_scan_age_s": 1.5,

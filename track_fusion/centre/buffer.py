@@ -4,27 +4,52 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from collections.abc import Iterator
 from typing import NamedTuple
 
-from track_fusion.centre.config import CentreConfig
+import numpy as np
+
+from track_fusion.centre.config import CentreConfig, ScanBufferParams
 from track_fusion.tracks import SECOND_NS, TrackBatch
+
+#: So many stamps of a source tell its period: their median difference bears a few lost or jumping ones.
+STAMPS_KEPT = 9
+#: A source is due this share of a period after its last scan: stamps jitter.
+DUE_SHARE = 0.9
 
 
 class Waiting(NamedTuple):
-    """A scan that waits: its stamp, when its first piece came, its tracks."""
+    """A scan that waits: its stamp, when its first and its last piece came, its tracks."""
 
     stamp_ns: int
     arrival_ns: int
+    touched_ns: int
     scan: TrackBatch
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Queue:
-    """The scans of one source that wait, in order; the stamp of its newest one; when it was last heard; -1 = never."""
+    """The scans of one source on their way.
+
+    Attributes
+    ----------
+    waiting : tuple of Waiting    in the order of their stamps
+    taken_ns : int                stamp of the newest one that a step took, -1 = none yet
+    heard_ns : int                when one was last taken in, -1 = never
+    stamps : tuple of int         the newest few taken in, ascending
+    ids, expected : frozenset     of a source in pieces: the tracks of its newest scan so far, those of the one before
+    """
 
     waiting: tuple[Waiting, ...] = ()
-    newest_ns: int = -1
+    taken_ns: int = -1
     heard_ns: int = -1
+    stamps: tuple[int, ...] = ()
+    ids: frozenset[int] = frozenset()
+    expected: frozenset[int] = frozenset()
+
+    def newest_ns(self, horizon_ns: int) -> int:
+        """Return the newest stamp up to a time, -1 = none."""
+        return max((w.stamp_ns for w in self.waiting if w.stamp_ns <= horizon_ns), default=self.taken_ns)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -34,11 +59,17 @@ class ScanBuffer:
     Attributes
     ----------
     queues : tuple of Queue, (S,)
-    fused_ns : int                   time of the last step, -1 before the first
+    fused_ns : int        time of the last step, -1 before the first
+    ran_ns : int          when it ran
+    published_ns : int    at which time its tracks were published
+    now_ns : int          the time that was told last
     """
 
     queues: tuple[Queue, ...]
     fused_ns: int = -1
+    ran_ns: int = -1
+    published_ns: int = -1
+    now_ns: int = -1
 
     @classmethod
     def empty(cls, config: CentreConfig) -> ScanBuffer:
@@ -46,17 +77,36 @@ class ScanBuffer:
         return cls((Queue(),) * len(config.sources))
 
     def silence_s(self, source: int, now_ns: int) -> float:
-        """Seconds since the source was last heard (or since the first scan of any); negative: nothing yet."""
+        """Seconds since a scan of the source was taken in (or the first of any was); negative: nothing yet."""
         heard = self.queues[source].heard_ns
         return -1.0 if heard < 0 else (now_ns - heard) / SECOND_NS
 
 
 class Step(NamedTuple):
-    """A step that may run: its time, the new scans by source, counts of those that a newer one superseded."""
+    """A step that may run.
+
+    Attributes
+    ----------
+    time_ns : int
+    scans : dict           the new scans by source
+    kept_out : Counter     scans that take no part, by reason
+    publish_ns : int       at which time its tracks are published
+    late : tuple           source, scan and stamp of those that belong to the past, for retrodiction
+    predicted : int        how many more of them there are, among the scans or kept out
+    """
 
     time_ns: int
     scans: dict[int, TrackBatch]
-    superseded: Counter[str]
+    kept_out: Counter[str]
+    publish_ns: int
+    late: tuple[tuple[int, TrackBatch, int], ...] = ()
+    predicted: int = 0
+
+
+def period_ns(queue: Queue) -> int:
+    """Tell the period of a source, the median difference of its stamps, 0 = unknown yet."""
+    gaps = sorted(b - a for a, b in zip(queue.stamps, queue.stamps[1:], strict=False))
+    return gaps[len(gaps) // 2] if gaps else 0
 
 
 def add(
@@ -76,56 +126,83 @@ def add(
     Returns
     -------
     ScanBuffer
-    str or None    `stale_scan`, `out_of_order_scan`, `duplicate_scan`, `late_scan`, `duplicate_track_id`
+    str or None    `stale_scan`, `out_of_order_scan`, `duplicate_scan`, `late_scan`, `duplicate_track_id` (of a piece
+                   those tracks alone are turned away that its scan has already)
     """
-    # The silence of sources that were never heard begins with the first scan of any.
-    queues = [q if q.heard_ns >= 0 else Queue(heard_ns=now_ns) for q in buffer.queues]
-    queue = Queue(queues[source].waiting, queues[source].newest_ns, now_ns)
-    reason = _refusal(config, buffer, queue, stamp_ns, now_ns)
-    if reason is None and stamp_ns == queue.newest_ns:
-        queue, reason = _assembled(config.sources[source].assembles, queue, scan)
-    elif reason is None:
-        queue = Queue((*queue.waiting, Waiting(stamp_ns, now_ns, scan.owned())), stamp_ns, now_ns)
+    queue = buffer.queues[source]
+    reason = _refusal(config.buffer, buffer, queue, stamp_ns, now_ns)
+    if reason is None:
+        queue, reason = _taken_in(config, source, queue, Waiting(stamp_ns, now_ns, now_ns, scan))
+    queues = list(buffer.queues)
+    if reason is None:
+        # The silence of sources that were never heard begins with the first scan of any.
+        queues = [q if q.heard_ns >= 0 else dataclasses.replace(q, heard_ns=now_ns) for q in queues]
+        queue = dataclasses.replace(queue, heard_ns=now_ns)
     queues[source] = queue
-    return ScanBuffer(tuple(queues), buffer.fused_ns), reason
+    return dataclasses.replace(buffer, queues=tuple(queues), now_ns=now_ns), reason
 
 
-def _refusal(config: CentreConfig, buffer: ScanBuffer, queue: Queue, stamp_ns: int, now_ns: int) -> str | None:
-    if stamp_ns < now_ns - config.buffer.max_delay_s * SECOND_NS:
+def _refusal(params: ScanBufferParams, buffer: ScanBuffer, queue: Queue, stamp_ns: int, now_ns: int) -> str | None:
+    if stamp_ns < now_ns - params.max_delay_s * SECOND_NS:
         return "stale_scan"
-    if stamp_ns < queue.newest_ns:
+    if stamp_ns >= buffer.fused_ns or stamp_ns == queue.taken_ns or params.out_of_sequence == "retrodict":
+        return None
+    if stamp_ns < queue.taken_ns:
         return "out_of_order_scan"
-    late = queue.newest_ns < stamp_ns < buffer.fused_ns
-    return "late_scan" if late and config.buffer.out_of_sequence == "neglect" else None
+    return "late_scan" if params.out_of_sequence == "neglect" else None
 
 
-def _assembled(assembles: bool, queue: Queue, piece: TrackBatch) -> tuple[Queue, str | None]:
-    """Put a piece to the newest scan of its source, whose stamp it bears."""
-    if not assembles:
+def _taken_in(config: CentreConfig, source: int, queue: Queue, new: Waiting) -> tuple[Queue, str | None]:
+    """Sort a scan in, or put a piece to the scan whose stamp it bears; retrodiction puts it to one that was taken."""
+    assembles = config.sources[source].assembles
+    ids = frozenset(new.scan.track_id.tolist()) if assembles else frozenset[int]()
+    newest = queue.stamps[-1] if queue.stamps else -1
+    if new.stamp_ns == newest:
+        queue = dataclasses.replace(queue, ids=queue.ids | ids)
+    same = next((w for w in queue.waiting if w.stamp_ns == new.stamp_ns), None)
+    if same is None and new.stamp_ns == queue.taken_ns and not (assembles and config.retrodicts):
+        return queue, "late_scan" if assembles else "duplicate_scan"
+    if same is not None and not assembles:
         return queue, "duplicate_scan"
-    if not queue.waiting or queue.waiting[-1].stamp_ns != queue.newest_ns:
-        return queue, "late_scan"
-    last = queue.waiting[-1]
-    if set(piece.track_id.tolist()) & set(last.scan.track_id.tolist()):
-        return queue, "duplicate_track_id"
-    last = last._replace(scan=TrackBatch.concatenate([last.scan, piece]).owned())
-    return Queue((*queue.waiting[:-1], last), queue.newest_ns, queue.heard_ns), None
+    if same is not None:
+        return _joined(queue, same, new)
+    waiting = sorted((*queue.waiting, new._replace(scan=new.scan.owned())), key=lambda w: w.stamp_ns)
+    stamps = tuple(sorted({*queue.stamps, new.stamp_ns})[-STAMPS_KEPT:])
+    queue = dataclasses.replace(queue, waiting=tuple(waiting), stamps=stamps)
+    return dataclasses.replace(queue, ids=ids, expected=queue.ids) if new.stamp_ns > newest else queue, None
 
 
-def advance(config: CentreConfig, buffer: ScanBuffer, now_ns: int, living: bool) -> tuple[ScanBuffer, Step | None]:
-    """Return the next step that may run, or None.
+def _joined(queue: Queue, scan: Waiting, piece: Waiting) -> tuple[Queue, str | None]:
+    """Put those tracks of a piece to a scan that it lacks."""
+    lacking = ~np.isin(piece.scan.track_id, scan.scan.track_id)
+    reason = None if lacking.all() else "duplicate_track_id"
+    if not lacking.any():
+        return queue, reason
+    whole = TrackBatch.concatenate([scan.scan, piece.scan[lacking]]).owned()
+    grown = scan._replace(scan=whole, touched_ns=piece.arrival_ns)
+    waiting = tuple(grown if w is scan else w for w in queue.waiting)
+    return dataclasses.replace(queue, waiting=waiting), reason
 
-    When all sources have been silent for `source_timeout_s`, a step without scans runs as often, so that tracks coast.
+
+def advance(
+    config: CentreConfig, buffer: ScanBuffer, now_ns: int, living: bool, may_rewind: bool = True
+) -> tuple[ScanBuffer, Step | None]:
+    """Return the next step that may run, or None; the times of steps strictly increase.
+
+    When all sources have been silent for `source_timeout_s`, a step runs as often, so that tracks coast.
 
     Parameters
     ----------
-    living : bool    whether there are central tracks
+    living : bool        whether there are central tracks
+    may_rewind : bool    whether late scans are handed out for retrodiction, where the parameters ask for it; else they
+                         are predicted
     """
-    after, step = _popped(config, buffer, now_ns)
+    buffer = dataclasses.replace(buffer, now_ns=now_ns)
+    time_ns = _tick(config, buffer, now_ns) if config.buffer.trigger == "rate" else _due(config, buffer, now_ns)
     idle = now_ns - buffer.fused_ns >= config.buffer.source_timeout_s * SECOND_NS
-    if step is None and living and idle and all_silent(config, buffer, now_ns):
-        return ScanBuffer(buffer.queues, now_ns), Step(now_ns, {}, Counter())
-    return after, step
+    if time_ns is None and living and idle and all_silent(config, buffer, now_ns):
+        time_ns = now_ns
+    return (buffer, None) if time_ns is None else _taken(config, buffer, time_ns, now_ns, may_rewind)
 
 
 def all_silent(config: CentreConfig, buffer: ScanBuffer, now_ns: int) -> bool:
@@ -133,35 +210,128 @@ def all_silent(config: CentreConfig, buffer: ScanBuffer, now_ns: int) -> bool:
     return all(buffer.silence_s(k, now_ns) >= config.buffer.source_timeout_s for k in range(len(buffer.queues)))
 
 
-def _popped(config: CentreConfig, buffer: ScanBuffer, now_ns: int) -> tuple[ScanBuffer, Step | None]:
-    """Return the next step of scans that wait, or None."""
-    heads = [q.waiting[0] for q in buffer.queues if q.waiting]
-    if not heads:
-        return buffer, None
-    oldest = min(heads, key=lambda head: head[:2])
-    time_ns = max(oldest.stamp_ns, buffer.fused_ns)
-    overdue = now_ns - oldest.arrival_ns >= config.buffer.fusion_timeout_s * SECOND_NS
-    if not overdue and not _is_complete(config, buffer, time_ns, now_ns):
-        return buffer, None
-    scans: dict[int, TrackBatch] = {}
-    superseded: Counter[str] = Counter()
-    queues = []
-    for k, queue in enumerate(buffer.queues):
-        due = sum(head.stamp_ns <= time_ns for head in queue.waiting)
-        if due:
-            scans[k] = queue.waiting[due - 1].scan
-            superseded["superseded_scan"] += due - 1
-        queues.append(Queue(queue.waiting[due:], queue.newest_ns, queue.heard_ns) if due else queue)
-    return ScanBuffer(tuple(queues), time_ns), Step(time_ns, scans, +superseded)
+def wake_ns(config: CentreConfig, buffer: ScanBuffer, now_ns: int) -> int | None:
+    """Return when time alone may make a step due, coasting aside; None: only another scan can."""
+    return min((time_ns for time_ns in _deadlines(config, buffer, now_ns) if time_ns > now_ns), default=None)
 
 
-def _is_complete(config: CentreConfig, buffer: ScanBuffer, time_ns: int, now_ns: int) -> bool:
+def _deadlines(config: CentreConfig, buffer: ScanBuffer, now_ns: int) -> Iterator[int]:
+    params = config.buffer
+    if params.trigger == "rate":
+        period = round(SECOND_NS / params.output_rate_hz)
+        yield (now_ns // period + 1) * period
+        return
+    yield buffer.ran_ns + _least_gap_ns(params)
+    for queue in buffer.queues:
+        for waiting in queue.waiting:
+            since_ns = _since_ns(config, waiting)
+            yield since_ns
+            yield since_ns + round(params.gather_window_s * SECOND_NS)
+            yield since_ns + round(params.fusion_timeout_s * SECOND_NS)
+            yield waiting.touched_ns + round(params.assembly_window_s * SECOND_NS)
+
+
+def _least_gap_ns(params: ScanBufferParams) -> int:
+    return round(SECOND_NS / params.max_output_rate_hz) if params.max_output_rate_hz else 0
+
+
+def _since_ns(config: CentreConfig, waiting: Waiting) -> int:
+    """Tell since when a scan has waited: one ahead of the clock does not before its time."""
+    return max(waiting.arrival_ns, waiting.stamp_ns - config.clock.tolerance_ns)
+
+
+def _tick(config: CentreConfig, buffer: ScanBuffer, now_ns: int) -> int | None:
+    """Return the last tick, when no step has run at it and anything was heard."""
+    period = round(SECOND_NS / config.buffer.output_rate_hz)
+    time_ns = now_ns // period * period
+    heard = any(queue.heard_ns >= 0 for queue in buffer.queues)
+    return time_ns if heard and time_ns > buffer.fused_ns else None
+
+
+def _due(config: CentreConfig, buffer: ScanBuffer, now_ns: int) -> int | None:
+    """Return the time of the next step of scans that wait, when it may run."""
+    timeout_ns = round(config.buffer.fusion_timeout_s * SECOND_NS)
+    waiting = [w for q in buffer.queues for w in q.waiting if w.stamp_ns <= now_ns + config.clock.tolerance_ns]
+    ahead = [w for w in waiting if w.stamp_ns > buffer.fused_ns]
+    if waiting and not ahead:  # none advances time: when no other comes, one step of the least advance takes them up
+        overdue = now_ns - min(_since_ns(config, w) for w in waiting) >= timeout_ns
+        return buffer.fused_ns + 1 if overdue else None
+    time_ns = _next_stamp(config.buffer, buffer, [w.stamp_ns for w in ahead], now_ns)
+    if time_ns is None:
+        return None
+    waited_ns = now_ns - min(_since_ns(config, w) for w in ahead if w.stamp_ns == time_ns)
+    return time_ns if waited_ns >= timeout_ns or _is_complete(config, buffer, time_ns, now_ns, waited_ns) else None
+
+
+def _next_stamp(params: ScanBufferParams, buffer: ScanBuffer, stamps: list[int], now_ns: int) -> int | None:
+    """Return which of the stamps is the time of the next step; those closer than the rate allows are joined."""
+    gap_ns = _least_gap_ns(params) if buffer.fused_ns >= 0 else 0
+    far = [stamp_ns for stamp_ns in stamps if stamp_ns >= buffer.fused_ns + gap_ns]
+    if far:
+        return min(far)
+    return max(stamps) if stamps and now_ns >= buffer.ran_ns + gap_ns else None
+
+
+def _is_complete(config: CentreConfig, buffer: ScanBuffer, time_ns: int, now_ns: int, waited_ns: int) -> bool:
     """Tell whether all scans of a time are there, as far as the trigger asks, each with all its pieces."""
+    params, timeout_ns = config.buffer, config.buffer.source_timeout_s * SECOND_NS
+    gathered = waited_ns >= params.gather_window_s * SECOND_NS
     for queue, source in zip(buffer.queues, config.sources, strict=True):
-        started = bool(queue.waiting) and queue.waiting[0].stamp_ns <= time_ns
-        if source.assembles and started and queue.newest_ns <= time_ns:
+        if source.assembles and _in_pieces(params, queue, time_ns, now_ns):
             return False
-        live = now_ns - queue.heard_ns < config.buffer.source_timeout_s * SECOND_NS
-        if config.buffer.trigger == "all_sources" and live and queue.newest_ns < time_ns:
+        newest_ns, live = queue.newest_ns(now_ns + config.clock.tolerance_ns), now_ns - queue.heard_ns < timeout_ns
+        if not live or newest_ns >= time_ns:
+            continue
+        if params.trigger == "all_sources" or (not gathered and _is_due(queue, newest_ns, time_ns)):
             return False
     return True
+
+
+def _is_due(queue: Queue, newest_ns: int, time_ns: int) -> bool:
+    period = period_ns(queue)
+    return period > 0 and time_ns - newest_ns >= DUE_SHARE * period
+
+
+def _in_pieces(params: ScanBufferParams, queue: Queue, time_ns: int, now_ns: int) -> bool:
+    """Tell whether the newest scan of a source, if stamped up to a time, may lack pieces."""
+    if not queue.waiting or queue.waiting[-1].stamp_ns > time_ns or queue.waiting[-1].stamp_ns < queue.stamps[-1]:
+        return False
+    if params.trigger == "all_sources":
+        return True  # whatever the order of arrival across sources, the steps are the same
+    all_there = bool(queue.expected) and queue.expected <= queue.ids
+    return not all_there and now_ns - queue.waiting[-1].touched_ns < params.assembly_window_s * SECOND_NS
+
+
+def _taken(
+    config: CentreConfig, buffer: ScanBuffer, time_ns: int, now_ns: int, may_rewind: bool
+) -> tuple[ScanBuffer, Step]:
+    """Take the scans of a step: of each source the newest one up to its time, and the late ones for retrodiction."""
+    params, past_ns = config.buffer, buffer.fused_ns if config.retrodicts else -1
+    scans: dict[int, TrackBatch] = {}
+    kept_out: Counter[str] = Counter()
+    late: list[tuple[int, TrackBatch, int]] = []
+    predicted = 0
+    queues = list(buffer.queues)
+    for k, queue in enumerate(buffer.queues):
+        due = [w for w in queue.waiting if w.stamp_ns <= time_ns]
+        if params.trigger == "rate" and config.sources[k].assembles and _in_pieces(params, queue, time_ns, now_ns):
+            due = due[:-1]
+        if not due:
+            continue
+        past, new = [w for w in due if w.stamp_ns <= past_ns], [w for w in due if w.stamp_ns > past_ns]
+        if may_rewind:
+            late += [(k, w.scan, w.stamp_ns) for w in past]
+        else:  # as those are that `predict` lets in
+            usable = [w for w in past if w.stamp_ns > queue.taken_ns]
+            kept_out["out_of_order_scan"] += len(past) - len(usable)
+            predicted, new = predicted + len(past), usable + new
+        kept_out["superseded_scan"] += max(len(new) - 1, 0)
+        if new and time_ns - new[-1].stamp_ns > config.params.max_scan_age_s * SECOND_NS:
+            kept_out["aged_scan"] += 1
+        elif new:
+            scans[k] = new[-1].scan
+        taken_ns = max(queue.taken_ns, due[-1].stamp_ns)
+        queues[k] = dataclasses.replace(queue, waiting=queue.waiting[len(due) :], taken_ns=taken_ns)
+    publish_ns = time_ns if params.publish_at == "stamp" else max(now_ns, time_ns, buffer.published_ns + 1)
+    step = Step(time_ns, scans, +kept_out, publish_ns, tuple(late), predicted)
+    return ScanBuffer(tuple(queues), time_ns, now_ns, publish_ns, now_ns), step

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from track_fusion.clock import ClockParams
 from track_fusion.linalg import Array
 from track_fusion.models.base import Motion
 from track_fusion.models.transforms import Transform
@@ -81,12 +82,34 @@ class ScanBufferParams(Params):
     """When a fusion step runs and which scans are too late for it."""
 
     trigger: str = param(
-        "all_sources",
-        "all_sources: fuse once every live source has delivered a scan of that time or later; "
-        "any_source: fuse at every scan",
-        choices=("all_sources", "any_source"),
+        "any_source",
+        "any_source: a scan makes a step, which waits gather_window_s for live sources that are due at its stamp; "
+        "all_sources: a step waits until every live source has delivered a scan of its time or later; "
+        "rate: a step at each tick of output_rate_hz",
+        choices=("any_source", "all_sources", "rate"),
     )
-    fusion_timeout_s: float = param(0.1, "how long a scan waits for the other sources", unit="s", low=0.0)
+    gather_window_s: float = param(
+        0.004, "any_source: so long a step waits for sources that are due", unit="s", low=0.0
+    )
+    output_rate_hz: float = param(10.0, "rate: steps a second", unit="Hz", low=0.0, strict=True)
+    max_output_rate_hz: float = param(
+        0.0, "scans that come closer together than this allows are joined in one step; 0: no limit", unit="Hz", low=0.0
+    )
+    publish_at: str = param(
+        "stamp",
+        "stamp: tracks are published at the time of their step; now: they are predicted to the clock's time",
+        choices=("stamp", "now"),
+    )
+    assembly_window_s: float = param(
+        0.01,
+        "a scan in pieces (Odometry) is complete so long after its last piece, unless all tracks of its source's last "
+        "scan are there sooner; with all_sources: when its source's next scan begins",
+        unit="s",
+        low=0.0,
+    )
+    fusion_timeout_s: float = param(
+        0.1, "how long a scan waits for the other sources, or for a step of a later time", unit="s", low=0.0
+    )
     source_timeout_s: float = param(
         1.0,
         "after this silence a source is not waited for; when all are silent, tracks coast",
@@ -97,7 +120,7 @@ class ScanBufferParams(Params):
     max_delay_s: float = param(10.0, "a scan older than this on arrival is rejected", unit="s", low=0.0, strict=True)
     out_of_sequence: str = param(
         "predict",
-        "a scan that is no later than the last step: neglect it; predict it, as its source's newest, to the next one; "
+        "a scan that is no later than the last step: neglect it; predict it to the next one as its source's newest; "
         "or retrodict, repeat the steps since its stamp (needs memory: true)",
         choices=("neglect", "predict", "retrodict"),
     )
@@ -148,8 +171,7 @@ class SourceConfig:
     Attributes
     ----------
     name : str
-    assembles : bool               its scans arrive piece by piece (one message a track), so that a scan is complete
-                                   only when a later one has begun
+    assembles : bool               its scans arrive piece by piece (one message a track)
     transform : Transform or None  from its axes and frame to the centre's; None = it has those of the centre
     """
 
@@ -173,6 +195,7 @@ class CentreConfig:
     manager : TrackManagerParams
     buffer : ScanBufferParams
     random : RandomParams              what rules that sample draw from, step after step
+    clock : ClockParams                how far the clocks may be trusted
 
     Raises
     ------
@@ -190,6 +213,7 @@ class CentreConfig:
     manager: TrackManagerParams = TrackManagerParams()
     buffer: ScanBufferParams = ScanBufferParams()
     random: RandomParams = RandomParams(role="fusion_centre")
+    clock: ClockParams = ClockParams()
 
     def __post_init__(self) -> None:
         if len(self.sources) > MAX_SOURCES:
@@ -265,6 +289,11 @@ class CentreConfig:
         every = np.ones(self.layout.size, bool)
         rows = [every if s.transform is None else s.transform.brings for s in self.sources]
         return np.array(rows, bool).reshape(-1, self.layout.size)
+
+    @property
+    def joins_scans(self) -> bool:
+        """Whether a step may take up scans of stamps before its own."""
+        return self.buffer.trigger == "rate" or self.buffer.max_output_rate_hz > 0
 
     @property
     def retrodicts(self) -> bool:

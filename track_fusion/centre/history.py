@@ -54,6 +54,11 @@ class Named(NamedTuple):
     state: CentreState
     ids: Ids
 
+    @property
+    def tracks(self) -> TrackBatch:
+        """All living central tracks, as readers know them."""
+        return self.state.central.tracks.replace(track_id=self.ids)
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Kept:
@@ -103,6 +108,11 @@ class History:
     def begin_ns(self) -> int:
         """A scan stamped later than this finds its place."""
         return (self.kept[0].before if self.kept else self.present).state.time_ns
+
+    @property
+    def length_s(self) -> float:
+        """Seconds over which steps can be repeated."""
+        return (self.present.state.time_ns - self.kept[0].time_ns) / SECOND_NS if self.kept else 0.0
 
 
 class Rewound(NamedTuple):
@@ -196,8 +206,9 @@ def _stepped(
 
 
 def _exchanged(words: Ids, meanings: Ids, ids: Ids) -> Ids:
-    """Exchange identifiers, each one of the words, which ascend, for their meanings."""
-    meant = np.asarray(meanings[np.searchsorted(words, ids)])
+    """Exchange identifiers, each one of the words, for their meanings."""
+    order = np.argsort(words, kind="stable")
+    meant = np.asarray(meanings[order[np.searchsorted(words, ids, sorter=order)]])
     meant.setflags(write=False)
     return meant
 
@@ -227,7 +238,7 @@ def _placed(config: CentreConfig, history: History, late: Iterable[Late]) -> tup
         if scan.stamp_ns <= history.begin_ns:
             kept_out["older_than_history"] += 1
             continue
-        at = _its_step(steps, scan)
+        at = _its_step(config, steps, scan)
         scans, reason = _with(config.sources[scan.source].assembles, steps[at].scans, scan)
         kept_out.update([reason] if reason else [])
         if scans is not None:
@@ -240,8 +251,8 @@ def _time_ns(kept: Kept) -> int:
     return kept.time_ns
 
 
-def _its_step(steps: list[Kept], late: Late) -> int:
-    """Return the index of the step of a late scan, a new one where none is at its stamp.
+def _its_step(config: CentreConfig, steps: list[Kept], late: Late) -> int:
+    """Return the index of the step of a late scan: one at its stamp, or the next one where steps join scans.
 
     The step that took a scan of the same stamp is the one: it tells repeated scans, and pieces of one.
     """
@@ -250,7 +261,7 @@ def _its_step(steps: list[Kept], late: Late) -> int:
         if taken is not None and taken.stamp_ns == late.stamp_ns:
             return at
     at = bisect_left(steps, late.stamp_ns, key=_time_ns)
-    if steps[at].time_ns != late.stamp_ns:
+    if steps[at].time_ns != late.stamp_ns and not config.joins_scans:
         steps.insert(at, Kept(steps[at].before, late.stamp_ns, {}, {}))
     return at
 
@@ -286,8 +297,7 @@ def _founders(info: StepInfo) -> dict[Sighting, int]:
 
 
 def _published_ids(config: CentreConfig, present: Named) -> Ids:
-    tracks = present.state.central.tracks
-    return publish(config.params, tracks.replace(track_id=present.ids)).track_id
+    return publish(config.params, present.tracks).track_id
 
 
 def _named(course: History, claims: set[Claim], seen: set[int], next_id: int) -> History:

@@ -103,6 +103,7 @@ class FusionCentreNode(ManagedNode):
             CentreConfig(
                 sources, motion, self.frame.frame_id, rule, rule_params, declare(self, FusionCentreParams),
                 declare(self, TrackManagerParams), declare(self, ScanBufferParams), declare(self, RandomParams),
+                self.clock,
             )
         )  # fmt: skip
         self._latency_s = 0.0
@@ -151,7 +152,6 @@ class FusionCentreNode(ManagedNode):
         return read
 
     def _take(self, source: int, scan: TrackBatch, stamp_ns: int, now_ns: int) -> None:
-        now_ns = max(now_ns, stamp_ns)
         if reason := self.centre.receive(source, scan, stamp_ns, now_ns):
             name = self.sources.source_configurations[source]
             self.reject({reason: 1}, f"a scan of {name} stamped {stamp_ns / 1e9:.3f} s")
@@ -170,7 +170,7 @@ class FusionCentreNode(ManagedNode):
         """Publish what is due by now."""
         began = time.perf_counter()
         for result in self.centre.advance(now_ns):
-            self.reject(result.superseded, "a newer scan of the source came before its fusion")
+            self.reject(result.kept_out, "a newer scan of the source came before its fusion, or it was too old for it")
             self._publish(result.tracks, result.time_ns)
             self._latency_s = time.perf_counter() - began
             self._last = result.info
@@ -179,6 +179,11 @@ class FusionCentreNode(ManagedNode):
             self.counted["unsound"] += result.info.unsound
             self.counted["beyond_half_circle"] += result.info.beyond_half_circle
             self.counted["deleted"] += len(result.info.changes.deleted)
+            self.counted["late_scans_predicted"] += result.predicted
+            if result.rewound is not None:
+                self.counted["rewinds"] += result.rewound.repeated > 0
+                self.counted["repeated_steps"] += result.rewound.repeated
+                self.counted["vanished"] += len(result.rewound.vanished)
             began = time.perf_counter()
 
     def _publish(self, fused: TrackBatch, stamp_ns: int) -> None:
@@ -205,6 +210,8 @@ class FusionCentreNode(ManagedNode):
             warnings.append(f"{unsound} fusions gave no density; a single source was taken instead")
         if beyond := self.counted["beyond_half_circle"]:
             warnings.append(f"{beyond} fusions were of angles more than a half circle apart, which have no mean")
+        if self.centre.config.retrodicts:
+            values["history_s"] = round(self.centre.history.length_s, 3)
         if self._last is not None:
             values["members"] = self._last.members.tolist()
             if self._last.shared_provenance and rule.guarantee_at(self.centre.config.rule_params) != "conservative":

@@ -22,6 +22,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from msg_adapters.arrays import MessageError
 from msg_adapters.diagnostics import diagnostic_array
 from msg_adapters.types import message_class
+from track_fusion.clock import ClockParams
 from track_fusion.nodes.ros_params import declare, refuse_unknown, unfit_files
 from track_fusion.params import Fault, ParameterError, Params, param
 
@@ -86,7 +87,7 @@ class ManagedNode(LifecycleNode):
         self._held: deque[tuple[Callable[[Any], None], Any]] = deque()
         self._look: Any = None
         self._wall = Clock(clock_type=ClockType.STEADY_TIME)
-        self.managed = declare(self, ManagedParams)
+        self.managed, self.clock = declare(self, ManagedParams), declare(self, ClockParams)
         self.declare_parameters_()
         refuse_unknown(self)
         self._warn_of_unfit_files(kwargs)
@@ -263,7 +264,11 @@ class ManagedNode(LifecycleNode):
         return self.create_timer(period_s, call, clock=self._wall)
 
     def _on_jump(self, jump: Any) -> None:
-        self.log.warning("The clock has jumped back: starting anew.")
+        back_ns = -int(jump.delta.nanoseconds)
+        if back_ns <= self.clock.tolerance_ns:
+            self.counted["clock_steps"] += 1
+            return
+        self.log.warning(f"The clock has jumped back by {back_ns / 1e9:.3f} s: starting anew.")
         self.counted["clock_jumps"] += 1
         self._held.clear()
         self.on_clock_jump()
