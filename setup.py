@@ -25,7 +25,7 @@ name = stated("name")
 # No wheels for other processors: there ROS comes from apt, and tools/make_venv.py leaves this extra out.
 ROS_WHEELS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
 CLI = ["click>=8.1", "jsonschema>=4.10", "rich>=13"]
-BAGS = ["rosbags>=0.10"]
+BAGS = ["rosbags>=0.10", "pyyaml>=6"]
 REPORT = ["matplotlib>=3.6"]
 SCENARIOS = ["pymap3d>=3"]
 TEST = [

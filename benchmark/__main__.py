@@ -11,16 +11,9 @@ from benchmark.measure import Result
 
 #: Every benchmark module, by name, in the order of running: each has `run()`, which yields results.
 MODULES = (
-    "rules",
-    "elliptical",
-    "mixture",
-    "association",
-    "retrodiction",
-    "monte_carlo",
-    "wire",
-    "lockstep",
+    "rules", "elliptical", "mixture", "association", "retrodiction", "monte_carlo", "wire", "bag_fuse", "lockstep",
     "latency",
-)
+)  # fmt: skip
 
 try:
     from rich.console import Console

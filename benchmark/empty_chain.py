@@ -50,15 +50,12 @@ class EmptyCentre(FusionCentreNode):
         self._message, self._there = canned(), set()
         super().connect()
 
-    def _reader(self, source, kind):
-        def read(msg):
-            self._there.add(source)
-            if len(self._there) == len(self.sources.source_configurations):
-                self._there.clear()
-                self._message.header.stamp = msg.header.stamp
-                self._tracks.publish(self._message)
-
-        return read
+    def _take(self, source, msg):
+        self._there.add(source)
+        if len(self._there) == len(self.messages.sources):
+            self._there.clear()
+            self._message.header.stamp = msg.header.stamp
+            self._tracks.publish(self._message)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from benchmark.measure import Result, race
-from track_fusion.centre.config import CentreConfig, FusionCentreParams, ScanBufferParams, SourceConfig
+from track_fusion.centre.config import CentreConfig, FusionCentreParams, IdentityParams, ScanBufferParams, SourceConfig
 from track_fusion.centre.history import History, Late, forward, rewind
 from track_fusion.centre.state import CentreState
 from track_fusion.centre.step import step
@@ -30,7 +30,8 @@ def _config(out_of_sequence: str) -> CentreConfig:
     rule, sources = RULES["covariance_intersection"], (SourceConfig("sensor_1"), SourceConfig("sensor_2"))
     motion = NearlyConstantVelocity(planar_layout(), MotionParams())
     params, buffer = FusionCentreParams(memory=True), ScanBufferParams(out_of_sequence=out_of_sequence)
-    return CentreConfig(sources, motion, "map", rule, rule.params(), params, buffer=buffer)
+    identity = IdentityParams("retrodiction")
+    return CentreConfig(sources, motion, "map", rule, rule.params(), params, buffer=buffer, identity=identity)
 
 
 def _scan(rng: np.random.Generator, count: int, time_ns: int) -> TrackBatch:

@@ -5,15 +5,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 
-from sensor_msgs.msg import PointField
-
 #: How many field lists are remembered, of each kind. A node meets one for each of its publishers.
 PLANS = 64
 #: Datatypes of a PointField as NumPy codes without byte order.
-CODES = {
-    PointField.INT8: "i1", PointField.UINT8: "u1", PointField.INT16: "i2", PointField.UINT16: "u2",
-    PointField.INT32: "i4", PointField.UINT32: "u4", PointField.FLOAT32: "f4", PointField.FLOAT64: "f8",
-}  # fmt: skip
+CODES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 #: Bytes of a double.
 WORD = 8
 

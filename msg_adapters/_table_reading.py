@@ -5,14 +5,16 @@ from __future__ import annotations
 import itertools
 import operator
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sensor_msgs.msg import PointCloud2
 
 from msg_adapters._table import CODES, WORD, cov_name, upper_pairs
 from msg_adapters.arrays import Floats, MessageError
+
+if TYPE_CHECKING:
+    from sensor_msgs.msg import PointCloud2
 
 #: How many missing fields an error names.
 NAMED_MISSING = 8

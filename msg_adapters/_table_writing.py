@@ -3,30 +3,40 @@
 from __future__ import annotations
 
 import dataclasses
+from array import array
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sensor_msgs.msg import PointCloud2, PointField
 
 from msg_adapters._table import CODES, PLANS, WORD, cov_name, upper_pairs
 from msg_adapters.arrays import Floats
+from msg_adapters.classes import Classes, message_class
 from msg_adapters.header import make_header
+
+if TYPE_CHECKING:
+    from sensor_msgs.msg import PointCloud2
 
 _DATATYPES = {code: datatype for datatype, code in CODES.items()}
 
 
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """What is said in a sensor_msgs/PointField."""
+
+    name: str
+    offset: int
+    datatype: int
+    count: int
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Layout:
-    """How rows are written: an aligned structured type, and the field list that tells of it.
-
-    The PointFields are shared by all messages of a layout (making 30 of them costs as much as all the
-    rest): do not change those of a message.
-    """
+    """How rows are written: an aligned structured type, and the field list that tells of it."""
 
     dtype: np.dtype[Any]
-    fields: tuple[PointField, ...]
+    fields: tuple[Place, ...]
     upper: NDArray[np.intp]  # the upper triangle in a flattened (n, n)
 
 
@@ -58,19 +68,30 @@ def make_layout(columns: tuple[tuple[str, str, int], ...], axes: tuple[str, ...]
     return Layout(dtype, tuple(fields), upper)
 
 
-def _field(name: str, offset: int, code: str, count: int) -> PointField:
-    return PointField(name=name, offset=offset, datatype=_DATATYPES[code], count=count)
+def _field(name: str, offset: int, code: str, count: int) -> Place:
+    return Place(name, offset, _DATATYPES[code], count)
 
 
-def new_cloud(layout: Layout, rows: int, stamp_ns: int, frame_id: str) -> tuple[PointCloud2, NDArray[Any]]:
+@lru_cache(maxsize=2 * PLANS)
+def _point_fields(layout: Layout, classes: Classes) -> tuple[Any, ...]:
+    """Make the PointFields, shared by all messages of a layout: 30 of them cost as much as all the rest."""
+    kind = classes("sensor_msgs/msg/PointField")
+    return tuple(kind(**vars(place)) for place in layout.fields)
+
+
+def new_cloud(
+    layout: Layout, rows: int, stamp_ns: int, frame_id: str, classes: Classes = message_class
+) -> tuple[PointCloud2, NDArray[Any]]:
     """Make a cloud of zeroed rows, and the structured array (rows,) through which to fill it.
 
-    The array is the message's memory: filling it in place spares two copies.
+    The array is the message's memory: filling it in place spares two copies. The PointFields are shared with other
+    messages: do not change those of a message.
     """
     step = layout.dtype.itemsize
-    msg = PointCloud2(
-        header=make_header(stamp_ns, frame_id), height=1, width=rows, fields=list(layout.fields),
-        is_bigendian=False, point_step=step, row_step=rows * step, is_dense=True,
+    msg: PointCloud2 = classes("sensor_msgs/msg/PointCloud2")(
+        header=make_header(stamp_ns, frame_id, classes), height=1, width=rows,
+        fields=list(_point_fields(layout, classes)), is_bigendian=False, point_step=step, row_step=rows * step,
+        data=array("B"), is_dense=True,
     )  # fmt: skip
     if rows == 0:
         return msg, np.zeros(0, layout.dtype)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,6 +112,22 @@ class TrackArrays:
     def columns(self) -> dict[str, Any]:
         """All but the axes, by name: what a TrackBatch takes beside its layout."""
         return {name: value for name, value in vars(self).items() if name != "axes"}
+
+
+class RawScan(NamedTuple):
+    """The tracks of messages of one stamp and frame, in the order in which they came."""
+
+    stamp_ns: int
+    frame_id: str
+    tracks: TrackArrays
+
+
+class RawReading(NamedTuple):
+    """Scans in the order of their first messages; errors; of how many tracks something was supplied."""
+
+    scans: list[RawScan]
+    errors: list[MessageError]
+    supplied: int
 
 
 def slots_of(axes: Sequence[str], slots: Mapping[str, int], message: str) -> NDArray[np.intp]:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-
-from sensor_msgs.msg import PointCloud2
+from typing import TYPE_CHECKING
 
 from msg_adapters._table import PLANS, cov_name, upper_pairs
 from msg_adapters._table_reading import Block, Fields, Rows, Signature, signature
 from msg_adapters._table_writing import make_layout, new_cloud, upper_triangle
 from msg_adapters.arrays import DetectionArrays
 from msg_adapters.header import stamp_to_ns
+
+if TYPE_CHECKING:
+    from sensor_msgs.msg import PointCloud2
 
 
 def detection_table_to_msg(detections: DetectionArrays) -> PointCloud2:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from builtin_interfaces.msg import Time
-from std_msgs.msg import Header
+from typing import TYPE_CHECKING
 
 from msg_adapters.arrays import MessageError
+from msg_adapters.classes import Classes, message_class
+
+if TYPE_CHECKING:
+    from builtin_interfaces.msg import Time
+    from std_msgs.msg import Header
 
 NS_PER_S = 1_000_000_000
 #: The seconds of a builtin_interfaces/Time are an int32.
@@ -18,7 +22,7 @@ def stamp_to_ns(stamp: Time) -> int:
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
-def stamp_from_ns(time_ns: int) -> Time:
+def stamp_from_ns(time_ns: int, classes: Classes = message_class) -> Time:
     """Return nanoseconds since the epoch as a stamp.
 
     Raises
@@ -29,12 +33,12 @@ def stamp_from_ns(time_ns: int) -> Time:
     if not MIN_STAMP_NS <= time_ns <= MAX_STAMP_NS:
         raise ValueError(f"A stamp must lie between {MIN_STAMP_NS} and {MAX_STAMP_NS} ns. Got {time_ns}.")
     sec, nanosec = divmod(time_ns, NS_PER_S)
-    return Time(sec=sec, nanosec=nanosec)
+    return classes("builtin_interfaces/msg/Time")(sec=sec, nanosec=nanosec)
 
 
-def make_header(stamp_ns: int, frame_id: str) -> Header:
+def make_header(stamp_ns: int, frame_id: str, classes: Classes = message_class) -> Header:
     """Make a header from nanoseconds and a frame."""
-    return Header(stamp=stamp_from_ns(stamp_ns), frame_id=str(frame_id))
+    return classes("std_msgs/msg/Header")(stamp=stamp_from_ns(stamp_ns, classes), frame_id=str(frame_id))
 
 
 def check_header(header: Header, *, frame_id: str | None, now_ns: int, max_future_ns: int) -> int:

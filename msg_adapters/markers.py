@@ -36,7 +36,8 @@ def markers_to_msg(
     """Draw each track: an ellipse (x, y) or ellipsoid (x, y, z), an arrow for its velocity, its id.
 
     The first marker deletes all earlier ones, so that an empty scan clears the view. Tracks with a
-    value that is not finite are left out. Green is confirmed, amber tentative, grey coasted.
+    value that is not finite are left out. Green is confirmed, amber tentative, grey coasted. A track's markers bear its
+    number, less 2^32 from 2^31 on.
 
     Parameters
     ----------
@@ -64,9 +65,10 @@ def markers_to_msg(
     moves = "vx" in axes and "vy" in axes
     life = Duration(sec=int(lifetime_s), nanosec=int(lifetime_s % 1 * NS_PER_S))
     shape = Marker.SPHERE if "z" in axes else Marker.CYLINDER
+    # A marker's number has a sign and a track's has none: the same 32 bits, so that no two tracks share one.
+    numbers = tracks.track_id.astype(np.uint32).view(np.int32).tolist()
     for k, row in enumerate(drawn.tolist()):
-        # Numbered by row, not by track id: ids have 32 bits, a marker's number 31; all are deleted each time.
-        mark = partial(Marker, header=header, id=row, action=Marker.ADD, lifetime=life)
+        mark = partial(Marker, header=header, id=numbers[row], action=Marker.ADD, lifetime=life)
         r, g, b, a = _color(int(tracks.status[row]))
         here, color = position[k].tolist(), ColorRGBA(r=r, g=g, b=b, a=1.0)
         ellipsoid = Pose(position=_point(here), orientation=orientation[k])

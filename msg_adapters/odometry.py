@@ -11,15 +11,24 @@ from __future__ import annotations
 import re
 import zlib
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-from geometry_msgs.msg import Point, Pose, PoseWithCovariance, Twist, TwistWithCovariance, Vector3
-from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
 
-from msg_adapters.arrays import CrossBlock, Floats, MergedLike, MessageError, TrackArrays, one_track, slots_of
+from msg_adapters.arrays import CrossBlock, Floats, MergedLike, MessageError, TrackArrays, slots_of
 from msg_adapters.header import make_header, stamp_to_ns
-from msg_adapters.orientation import from_yaw, rotation_matrix, unit_quaternion, yaw_of, yaw_rotations
+from msg_adapters.orientation import (
+    bad_orientation,
+    from_yaw,
+    rotation_matrices,
+    unit_quaternions,
+    yaw_rotations,
+    yaws,
+)
+
+if TYPE_CHECKING:
+    from nav_msgs.msg import Odometry
 
 #: Where an axis stands in the message: 0 to 5 the pose, 6 to 11 the twist.
 _SLOT = {"x": 0, "y": 1, "z": 2, "yaw": 5, "vx": 6, "vy": 7, "vz": 8, "turn_rate": 11}
@@ -137,23 +146,73 @@ def odometry_from_msg(
     claim.
     """
     _check_parameters(cross_block, cross_weight, twist_frame)
-    slots = slots_of(axes, _SLOT, "an Odometry message")
     if not msg.child_frame_id:
-        raise MessageError("missing_child_frame", "The child_frame_id must name the track. Got an empty one.")
-    mean, cov = _state(msg, needs_orientation="yaw" in axes)
+        raise missing_child_frame()
+    values, track_id = values_of(msg), track_id_of(msg.child_frame_id, child_prefix)
+    tracks, good, absent = tracks_of(
+        values[None], axes, msg.header.frame_id, stamp_to_ns(msg.header.stamp), [track_id], cross_block,
+        cross_weight=cross_weight, twist_frame=twist_frame, status=status,
+    )  # fmt: skip
+    if not good[0]:
+        raise bad_orientation(*values[3:7].tolist())
+    return OdometryReading(tracks, absent)
+
+
+def values_of(msg: Odometry) -> Floats:
+    """Return the numbers of a message in the order of its definition, (85,): pose, its covariance, twist, its own."""
+    position, turn = msg.pose.pose.position, msg.pose.pose.orientation
+    linear, angular = msg.twist.twist.linear, msg.twist.twist.angular
+    pose = [position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w]
+    twist = [linear.x, linear.y, linear.z, angular.x, angular.y, angular.z]
+    return np.concatenate([pose, msg.pose.covariance, twist, msg.twist.covariance])
+
+
+def missing_child_frame() -> MessageError:
+    """Make the error for a message that names no track."""
+    return MessageError("missing_child_frame", "The child_frame_id must name the track. Got an empty one.")
+
+
+def tracks_of(
+    values: Floats, axes: Sequence[str], frame_id: str, stamp_ns: int, ids: Sequence[int], cross_block: CrossBlock,
+    *, cross_weight: float = 0.5, twist_frame: Literal["child", "parent"] = "child", status: int = 1,
+) -> tuple[TrackArrays, NDArray[np.bool_], bool]:  # fmt: skip
+    """Read the tracks of N messages of one stamp and frame, as odometry_from_msg says.
+
+    Parameters
+    ----------
+    values : (N, 85)    as values_of gives them
+    ids : (N,)
+
+    Returns
+    -------
+    TrackArrays     those that can be read
+    (N,) bool       which they are: not those without an orientation where one is needed
+    bool            whether a cross block is absent
+    """
+    slots = slots_of(axes, _SLOT, "an Odometry message")
     in_twist = slots >= _TWIST.start
-    if twist_frame == "child" and in_twist.any():
-        mean, cov = _to_parent(msg, mean, cov)
+    turns = twist_frame == "child" and bool(in_twist.any())
+    unit, good = unit_quaternions(values[:, 3:7])
+    if not (turns or "yaw" in axes):
+        good = np.ones(len(values), bool)
+    values, unit = values[good], unit[good]
+    mean, cov = _states(values, yaws(unit) if "yaw" in axes else np.zeros(len(unit)))
+    bent = np.flatnonzero(values[:, 3:6].any(1))
+    if turns and len(bent):  # the identity leaves every bit as it is
+        mean[bent], cov[bent] = _turned(mean[bent], cov[bent], rotation_matrices(unit[bent]))
     absent = bool(in_twist.any() and not in_twist.all())
-    cov = cov[slots[:, None], slots]
+    cov = cov[:, slots[:, None], slots]
     if absent and cross_block == "conservative":
         inflation = np.where(in_twist, 1 / (1 - cross_weight), 1 / cross_weight)
         cov *= np.where(in_twist[:, None] == in_twist, inflation, 1.0)
-    tracks = one_track(
-        tuple(axes), msg.header.frame_id, mean[slots], cov, time_ns=stamp_to_ns(msg.header.stamp),
-        track_id=track_id_of(msg.child_frame_id, child_prefix), status=status,
+    track_id = np.array(ids, np.int64)[good]
+    count = len(track_id)
+    tracks = TrackArrays(
+        axes=tuple(axes), frame_id=frame_id, weight=np.ones((count, 1)), mean=mean[:, None, slots], cov=cov[:, None],
+        time_ns=np.full(count, stamp_ns, np.int64), track_id=track_id, source=np.zeros(count, np.uint32),
+        status=np.full(count, status, np.uint8), existence=np.ones(count), dof=np.full(count, np.inf),
     )  # fmt: skip
-    return OdometryReading(tracks, absent)
+    return tracks, good, absent
 
 
 def track_id_of(name: str, prefix: str | None = None) -> int:
@@ -183,6 +242,9 @@ def _check_parameters(cross_block: str, cross_weight: float, twist_frame: str) -
 
 def _message(frame: str, child: str, stamp_ns: int, mean: list[float], cov: Floats, yaw: float) -> Odometry:
     """Build one message from a full state, the twist in the body frame."""
+    from geometry_msgs.msg import Point, Pose, PoseWithCovariance, Twist, TwistWithCovariance, Vector3
+    from nav_msgs.msg import Odometry
+
     pose = Pose(position=Point(x=mean[0], y=mean[1], z=mean[2]), orientation=from_yaw(yaw))
     twist = Twist(linear=Vector3(x=mean[6], y=mean[7], z=mean[8]), angular=Vector3(x=mean[9], y=mean[10], z=mean[11]))
     # Contiguous copies: a reshaped view would keep the whole batch alive.
@@ -194,25 +256,14 @@ def _message(frame: str, child: str, stamp_ns: int, mean: list[float], cov: Floa
     )
 
 
-def _state(msg: Odometry, needs_orientation: bool) -> tuple[Floats, Floats]:
-    """Return the full state, mean (12,) and cov (12, 12), the twist as it stands in the message."""
-    position, linear, angular = msg.pose.pose.position, msg.twist.twist.linear, msg.twist.twist.angular
-    yaw = yaw_of(msg.pose.pose.orientation) if needs_orientation else 0.0
-    mean = np.array([position.x, position.y, position.z, 0.0, 0.0, yaw,
-                     linear.x, linear.y, linear.z, angular.x, angular.y, angular.z], np.float64)  # fmt: skip
-    cov = np.zeros((_SIZE, _SIZE))
-    cov[_POSE, _POSE] = np.asarray(msg.pose.covariance).reshape(6, 6)
-    cov[_TWIST, _TWIST] = np.asarray(msg.twist.covariance).reshape(6, 6)
+def _states(values: Floats, yaw: Floats) -> tuple[Floats, Floats]:
+    """Return the full states, mean (N, 12) and cov (N, 12, 12), the twist as it stands in the messages."""
+    mean = np.zeros((len(values), _SIZE))
+    mean[:, :3], mean[:, 5], mean[:, _TWIST] = values[:, :3], yaw, values[:, 43:49]
+    cov = np.zeros((len(values), _SIZE, _SIZE))
+    cov[:, _POSE, _POSE] = values[:, 7:43].reshape(-1, 6, 6)
+    cov[:, _TWIST, _TWIST] = values[:, 49:].reshape(-1, 6, 6)
     return mean, cov
-
-
-def _to_parent(msg: Odometry, mean: Floats, cov: Floats) -> tuple[Floats, Floats]:
-    """Turn the twist from the body into the parent frame; the identity leaves every bit as it is."""
-    x, y, z, w = unit_quaternion(msg.pose.pose.orientation)
-    if x == y == z == 0.0:
-        return mean, cov
-    turned_mean, turned_cov = _turned(mean[None], cov[None], rotation_matrix(x, y, z, w)[None])
-    return turned_mean[0], turned_cov[0]
 
 
 def _turned(mean: Floats, cov: Floats, rotation: Floats) -> tuple[Floats, Floats]:

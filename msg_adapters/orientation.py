@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
-from geometry_msgs.msg import Quaternion
+from numpy.typing import NDArray
 
 from msg_adapters.arrays import Floats, MessageError
+
+if TYPE_CHECKING:
+    from geometry_msgs.msg import Quaternion
 
 #: How far the squared norm of a quaternion may be from 1; beyond, it is no orientation but an oversight.
 QUATERNION_TOLERANCE = 1e-2
@@ -20,25 +24,45 @@ def unit_quaternion(q: Quaternion) -> tuple[float, float, float, float]:
     ------
     MessageError    `bad_orientation`: not a number, zero (never filled in) or far from norm 1
     """
-    norm = float(q.x**2 + q.y**2 + q.z**2 + q.w**2)
-    if not abs(norm - 1.0) <= QUATERNION_TOLERANCE:
-        raise MessageError(
-            "bad_orientation",
-            f"The orientation must be a unit quaternion, since the twist is in its frame. Got ({q.x}, {q.y}, {q.z}, "
-            f"{q.w}) (x, y, z, w).",
-        )
-    scale = norm**-0.5
-    return q.x * scale, q.y * scale, q.z * scale, q.w * scale
+    unit, good = unit_quaternions(np.array([[q.x, q.y, q.z, q.w]]))
+    if not good[0]:
+        raise bad_orientation(q.x, q.y, q.z, q.w)
+    x, y, z, w = unit[0].tolist()
+    return x, y, z, w
+
+
+def unit_quaternions(q: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Scale quaternions (N, 4), x y z w, to norm 1, and tell which are orientations, (N,)."""
+    x, y, z, w = q.T
+    with np.errstate(all="ignore"):  # what is no orientation is told
+        norm = x * x + y * y + z * z + w * w
+        return q / np.sqrt(norm)[:, None], np.abs(norm - 1.0) <= QUATERNION_TOLERANCE
+
+
+def bad_orientation(x: float, y: float, z: float, w: float) -> MessageError:
+    """Make the error for a quaternion that is no orientation."""
+    return MessageError(
+        "bad_orientation",
+        f"The orientation must be a unit quaternion, since the twist is in its frame. Got ({x}, {y}, {z}, {w}) "
+        "(x, y, z, w).",
+    )
 
 
 def yaw_of(q: Quaternion) -> float:
     """Return the yaw of an orientation, rad; raise as unit_quaternion does."""
-    x, y, z, w = unit_quaternion(q)
-    return float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+    return float(yaws(np.array([unit_quaternion(q)]))[0])
+
+
+def yaws(unit: Floats) -> Floats:
+    """Return the yaw of each unit quaternion (N, 4), rad, (N,)."""
+    x, y, z, w = unit.T
+    return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
 def from_yaw(yaw: float) -> Quaternion:
     """Return the orientation of a turn about z, rad."""
+    from geometry_msgs.msg import Quaternion
+
     return Quaternion(x=0.0, y=0.0, z=float(np.sin(yaw / 2)), w=float(np.cos(yaw / 2)))
 
 
@@ -54,15 +78,24 @@ def yaw_rotations(yaw: Floats) -> Floats:
 
 def rotation_matrix(x: float, y: float, z: float, w: float) -> Floats:
     """Return the rotation (3, 3) of a unit quaternion."""
-    return np.array([
+    return np.asarray(rotation_matrices(np.array([[x, y, z, w]]))[0])
+
+
+def rotation_matrices(unit: Floats) -> Floats:
+    """Return the rotations (N, 3, 3) of unit quaternions (N, 4)."""
+    x, y, z, w = unit.T
+    rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    ]
+    return np.ascontiguousarray(np.moveaxis(np.array(rows), -1, 0))
 
 
 def from_matrix(r: list[list[float]]) -> Quaternion:
     """Return the orientation of a rotation matrix, by its largest component, which no cancellation spoils."""
+    from geometry_msgs.msg import Quaternion
+
     trace = r[0][0] + r[1][1] + r[2][2]
     squared = [1 + 2 * r[0][0] - trace, 1 + 2 * r[1][1] - trace, 1 + 2 * r[2][2] - trace, 1 + trace]
     big = max(range(4), key=squared.__getitem__)

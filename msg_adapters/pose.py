@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped
 
 from msg_adapters.arrays import TrackArrays, one_track, slots_of
 from msg_adapters.header import stamp_to_ns
+
+if TYPE_CHECKING:
+    from geometry_msgs.msg import PoseWithCovarianceStamped
 
 _SLOT = {"x": 0, "y": 1, "z": 2}
 

@@ -5,17 +5,20 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sensor_msgs.msg import PointCloud2
 
 from msg_adapters._table import PLANS, cov_name
 from msg_adapters._table_reading import Block, Column, Fields, Rows, Signature, signature
 from msg_adapters._table_writing import Layout, make_layout, new_cloud, upper_triangle
 from msg_adapters.arrays import MessageError, TrackArrays, TrackLike
+from msg_adapters.classes import Classes, message_class
 from msg_adapters.header import stamp_to_ns
+
+if TYPE_CHECKING:
+    from sensor_msgs.msg import PointCloud2
 
 _UUID_BYTES = 16
 _MAX_ID = 2**32 - 1
@@ -27,7 +30,9 @@ _RESERVED = frozenset({*_REQUIRED, "uuid", "dof", "phd"})
 MAX_PADDED_COMPONENTS = 1_000_000
 
 
-def track_table_to_msg(tracks: TrackLike, axes: Sequence[str], stamp_ns: int) -> PointCloud2:
+def track_table_to_msg(
+    tracks: TrackLike, axes: Sequence[str], stamp_ns: int, classes: Classes = message_class
+) -> PointCloud2:
     """Write tracks as one cloud, one row a component; components of weight 0 are padding and left out.
 
     Parameters
@@ -35,6 +40,7 @@ def track_table_to_msg(tracks: TrackLike, axes: Sequence[str], stamp_ns: int) ->
     tracks : TrackLike          N >= 0 tracks in one frame, as TrackArrays or the library's TrackBatch
     axes : sequence of str      the names of the n axes (`batch.layout.axes`)
     stamp_ns : int              header.stamp: the time for which every row is valid; also an empty scan has one
+    classes : callable          gives the classes of the message and its parts, those of ROS unless given
 
     Returns
     -------
@@ -57,7 +63,7 @@ def track_table_to_msg(tracks: TrackLike, axes: Sequence[str], stamp_ns: int) ->
         keep[:, 0] |= ~keep.any(1)  # a track does not vanish because its weights are wrong
         track = np.nonzero(keep)[0]
         weight, mean, cov = tracks.weight[keep], tracks.mean[keep], tracks.cov[keep]
-    msg, rows = new_cloud(layout, len(weight), stamp_ns, tracks.frame_id)
+    msg, rows = new_cloud(layout, len(weight), stamp_ns, tracks.frame_id, classes)
     for name in ("track_id", "status", "source", "existence"):
         rows[name] = getattr(tracks, name)[track]
     for name in ("uuid", "dof"):

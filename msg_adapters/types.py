@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from msg_adapters.arrays import CrossBlock, TrackArrays
+from msg_adapters.arrays import CrossBlock, RawReading, TrackArrays
+from msg_adapters.classes import message_class
 
 
 class Reading(NamedTuple):
@@ -27,6 +27,8 @@ class MessageType:
     read : callable      (message, axes wanted, what stands for a position-velocity block that is absent) -> Reading;
                          raises MessageError for what is malformed
     whole_scan : bool    a message holds all tracks of its stamp; else one track, and a later stamp ends the scan
+    read_raw : callable  the same of many serialised messages at once, for what comes in pieces; None: they are decoded
+                         one by one
     lacks : str          what a message cannot carry, under which readings that supply it are counted; empty: nothing
     """
 
@@ -34,27 +36,11 @@ class MessageType:
     read: Callable[[Any, Sequence[str], CrossBlock], Reading]
     whole_scan: bool = True
     lacks: str = ""
+    read_raw: Callable[[Sequence[bytes], Sequence[str], CrossBlock], RawReading] | None = None
 
     def load(self) -> type:
         """Import the class of the messages; raise as message_class does."""
         return message_class(self.message)
-
-
-def message_class(name: str) -> type:
-    """Import the class of a type such as sensor_msgs/msg/PointCloud2.
-
-    Raises
-    ------
-    ImportError    its package is not installed, or has no such message
-    """
-    package, _, kind = name.partition("/msg/")
-    try:
-        return getattr(importlib.import_module(f"{package}.msg"), kind)  # type: ignore[no-any-return]
-    except (ImportError, AttributeError) as error:
-        apt = f"ros-jazzy-{package.replace('_', '-')}"
-        raise ImportError(
-            f"Messages of the type {name} need the package '{package}' ({error}). Install {apt}."
-        ) from error
 
 
 def _read_table(msg: Any, axes: Sequence[str], cross_block: CrossBlock) -> Reading:
@@ -69,8 +55,16 @@ def _read_odometry(msg: Any, axes: Sequence[str], cross_block: CrossBlock) -> Re
     return Reading(*odometry_from_msg(msg, axes, cross_block))
 
 
+def _read_raw_odometry(messages: Sequence[bytes], axes: Sequence[str], cross_block: CrossBlock) -> RawReading:
+    from msg_adapters.odometry_raw import odometry_from_raw
+
+    return odometry_from_raw(messages, axes, cross_block)
+
+
 #: Ours by key: what `source_types` may hold.
 MESSAGE_TYPES: Mapping[str, MessageType] = {
     "track_table": MessageType("sensor_msgs/msg/PointCloud2", _read_table),
-    "odometry": MessageType("nav_msgs/msg/Odometry", _read_odometry, whole_scan=False, lacks="cross_block"),
+    "odometry": MessageType(
+        "nav_msgs/msg/Odometry", _read_odometry, whole_scan=False, lacks="cross_block", read_raw=_read_raw_odometry
+    ),
 }

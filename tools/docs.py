@@ -211,28 +211,36 @@ def fusion_centre_sections() -> list[Section]:
     from track_fusion.centre.config import (
         TRACK_RULES,
         FusionCentreParams,
+        IdentityParams,
         ScanBufferParams,
+        SourceSettings,
         StateFusionParams,
         TrackManagerParams,
     )
     from track_fusion.clock import ClockParams
+    from track_fusion.messages.centre import OneSourceParams, SourceParams
+    from track_fusion.messages.parameters import ManagedParams
+    from track_fusion.messages.screening import FrameParams
     from track_fusion.models.choices import MOTIONS, MotionChoice
-    from track_fusion.nodes.fusion_centre import SourceParams
-    from track_fusion.nodes.managed import ManagedParams
-    from track_fusion.nodes.screening import FrameParams
     from track_fusion.random_streams import RandomParams
 
     default, declared = StateFusionParams().state_fusion, "declared when state_fusion is"
     rules = {key: rule for key, rule in TRACK_RULES.own.items() if specs(rule.params)}
     return [
-        *map(Section, (FrameParams, SourceParams, MotionChoice)),
+        *map(Section, (FrameParams, SourceParams)),
+        *(
+            Section(kind, f"{name}.", title and f"{title} {name}.")
+            for name in SourceParams().source_configurations
+            for kind, title in ((OneSourceParams, "The source"), (SourceSettings, "What is declared of"))
+        ),
+        Section(MotionChoice),
         *_alternatives("motion", MOTIONS.own, MotionChoice().motion),
         *map(Section, (StateFusionParams, FusionCentreParams)),
         *(
             Section(rule.params, f"{key}.", f"{rule.title}: {declared} {key}.", declared=key == default)
             for key, rule in rules.items()
         ),
-        *map(Section, (ScanBufferParams, TrackManagerParams)),
+        *map(Section, (ScanBufferParams, TrackManagerParams, IdentityParams)),
         Section(RandomParams, title="Random numbers of rules that draw samples: seed, run and role name a stream."),
         Section(ClockParams),
         Section(ManagedParams),
@@ -242,9 +250,9 @@ def fusion_centre_sections() -> list[Section]:
 def sensor_tracker_sections() -> list[Section]:
     """List what a sensor tracker declares; a test compares it with the node."""
     from track_fusion.clock import ClockParams
+    from track_fusion.messages.parameters import ManagedParams
+    from track_fusion.messages.screening import FrameParams
     from track_fusion.models.choices import MOTIONS, SENSORS, Choice
-    from track_fusion.nodes.managed import ManagedParams
-    from track_fusion.nodes.screening import FrameParams
     from track_fusion.nodes.sensor_tracker import FeedbackParams, OutputParams
     from track_fusion.trackers.filters import FILTERS
     from track_fusion.trackers.many_targets import PdaTracker, PdaTrackerParams

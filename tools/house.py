@@ -24,7 +24,10 @@ FLOORS: tuple[Mapping[str, str], ...] = (
         "scenarios": "one published study a folder",
         "report": "pages and pictures",
     },
-    {"study": "what a scenario is: runs, outcomes, figures, claims and verdicts"},
+    {
+        "messages": "messages at the door: parameters, screening, a centre on messages; without ROS",
+        "study": "what a scenario is: runs, outcomes, figures, claims and verdicts",
+    },
     {"centre": "the fusion centre: a value and pure steps"},
     {"peers": "decentralised fusion"},
     {"trackers": "detections in, tracks out"},
@@ -44,7 +47,7 @@ GROUND = frozenset({"", "angles", "clock", "layouts", "linalg", "params", "plugi
 ROS_ROOMS = frozenset({"demo", "nodes"})
 #: The adapters stand beside the house: these rooms use them, they know nothing of it.
 ADAPTERS = "msg_adapters"
-ADAPTER_USERS = frozenset({"bags", "demo", "nodes"})
+ADAPTER_USERS = frozenset({"bags", "demo", "messages", "nodes"})
 #: What belongs to ROS beside message packages: by name, or by how the name begins.
 ROS = frozenset({"ament_index_python", "diagnostic_updater", "launch", "launch_ros", "message_filters", "rclpy"})
 ROS_PREFIXES = ("rosbag2_", "rosidl_", "tf2_")

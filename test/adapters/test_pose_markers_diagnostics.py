@@ -90,6 +90,15 @@ def test_a_track_in_space_is_an_ellipsoid(seed: int) -> None:
         check_ellipsoid(msg.markers[1 + 2 * k], tracks.cov[k, 0][1:, 1:][::-1, ::-1])
 
 
+def test_a_tracks_markers_bear_its_number_from_scan_to_scan() -> None:
+    """All 2^32 numbers fit, each another one."""
+    axes, numbers = ("x", "y", "vx", "vy"), [7, 2**31 - 1, 2**31, 2**32 - 1]
+    drawn = [markers_to_msg(make_tracks(4, track_id=np.array(ids)), axes, STAMP) for ids in (numbers, numbers[::-1])]
+    told = [{m.text: m.id for m in msg.markers if m.text} for msg in drawn]
+    assert told[0] == told[1] == {"7": 7, str(2**31 - 1): 2**31 - 1, str(2**31): -(2**31), str(2**32 - 1): -1}
+    assert {m.id for m in drawn[0].markers[1:]} == set(told[0].values())
+
+
 def test_tracks_that_cannot_be_drawn_are_left_out() -> None:
     tracks = make_tracks(3)
     tracks.cov[1, 0, 0, 0] = np.nan

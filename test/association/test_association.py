@@ -130,8 +130,10 @@ def test_a_miss_is_cheaper_than_a_pair_that_makes_another_miss_its_own():
 def test_sparse_solution_equals_dense(seed, monkeypatch):
     rng = np.random.default_rng(seed)
     found = gate(*scene(rng, 70, 60, 0.1), *scene(rng, 60, 60, 0.1), GAMMA, POSITION)
+    monkeypatch.setattr(assignment, "FEW_COMPONENTS", 10**9)
+    monkeypatch.setattr(assignment, "FEW_PAIRS", 10**9)
     dense = assign(found, 70, 60, GAMMA)
-    monkeypatch.setattr(assignment, "DENSE_CELLS", 0)
+    monkeypatch.setattr(assignment, "FEW_COMPONENTS", 0)
     np.testing.assert_array_equal(assign(found, 70, 60, GAMMA), dense)
     assert (dense < 0).any()
 
@@ -217,3 +219,28 @@ def test_nearest_pairs_have_the_least_total_distance_with_a_miss_at_reach(seed):
         for order in itertools.permutations(range(len(many)), len(few))
     )
     assert taken.sum() + 1.5 * (len(few) - len(row)) == pytest.approx(best)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_components_are_those_of_a_graph_search(seed):
+    """In plain numbers and by a graph: the same pairs together, whatever their order."""
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, assignment.FEW_PAIRS + 1)) if seed else assignment.FEW_PAIRS
+    cells = rng.permutation(60 * 60)[:count]
+    row, col = np.divmod(cells, 60)
+    neighbours = {}
+    for i, j in zip(row.tolist(), col.tolist(), strict=True):
+        neighbours.setdefault(("row", i), set()).add(("col", j))
+        neighbours.setdefault(("col", j), set()).add(("row", i))
+    wanted, left = set(), set(neighbours)
+    while left:
+        part, front = set(), [min(left)]
+        while front:
+            if (node := front.pop()) not in part:
+                part.add(node)
+                front += neighbours[node]
+        wanted.add(frozenset(k for k, i in enumerate(row.tolist()) if ("row", i) in part))
+        left -= part
+    for repeats in (1, 1 + assignment.FEW_PAIRS // count):  # the second goes by the graph
+        label = assignment._components(np.tile(row, repeats), np.tile(col, repeats), 60, 60)
+        assert {frozenset((np.flatnonzero(label == k) % count).tolist()) for k in set(label.tolist())} == wanted

@@ -9,7 +9,14 @@ from oracles.kalman import predict, update
 from scipy.stats import chi2
 
 from track_fusion.centre.centre import FusionCentre
-from track_fusion.centre.config import CentreConfig, FusionCentreParams, SourceConfig, TrackManagerParams
+from track_fusion.centre.config import (
+    CentreConfig,
+    FusionCentreParams,
+    IdentityParams,
+    SourceConfig,
+    TrackManagerParams,
+)
+from track_fusion.centre.history import History
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.models.turn import CoordinatedTurn, CoordinatedTurnParams
 from track_fusion.params import ParameterError
@@ -28,7 +35,8 @@ EAGER = TrackManagerParams(confirmation_threshold=(1, 1))
 def fusion_centre(sources, motion, rule, rule_params=None, params=None, **others):
     names = tuple(SourceConfig(f"source_{k}") for k in range(sources))
     params = params or FusionCentreParams()
-    return FusionCentre(CentreConfig(names, motion, "map", rule, rule_params or rule.params(), params, **others))
+    given = {"identity": IdentityParams("test")} | others
+    return FusionCentre(CentreConfig(names, motion, "map", rule, rule_params or rule.params(), params, **given))
 
 
 def centre(sources=2, rule="covariance_intersection", rule_params=None, manager=EAGER, motion=None, **params):
@@ -68,10 +76,19 @@ def random_scans(rng, sources):
     return scans
 
 
+#: One gate alone; links and duplicates as by default, with little patience; for sources that split targets.
+IDENTITY = {
+    "one gate": {"keep_probability": 1e-6, "patience": 0, "merge_duplicates": "off"},
+    "links": {"keep_probability": 0.9999, "patience": 2, "merge_duplicates": "across_sources"},
+    "shared": {"keep_probability": 0.9999, "patience": 1, "merge_duplicates": "also_within_a_source"},
+}
+
+
+@pytest.mark.parametrize("identity", IDENTITY)
 @pytest.mark.parametrize("memory", [False, True], ids=["memoryless", "memory"])
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_random_scenes_equal_the_oracle(seed, count, memory):
+def test_random_scenes_equal_the_oracle(seed, count, memory, identity):
     rng = np.random.default_rng(1000 * count + seed)
     names = [f"sensor_{k}" for k in range(count)]
     pairs = count + memory == 2  # what the oracle's covariance intersection can do
@@ -80,12 +97,15 @@ def test_random_scenes_equal_the_oracle(seed, count, memory):
     settings = Settings(
         names, max_scan_age_s=0.15, gate_probability=(0.99, 0.7)[seed % 2], confirmation_threshold=(2, 3),
         deletion_threshold=(3, 4), max_coast_s=0.7, process_noise=2.0, memory=memory,
+        **IDENTITY[identity],
     )  # fmt: skip
     wanted, _, margins = run_centre(scans, rule, settings)
     assert min(margins["gate"] + margins["assignment"], default=1.0) > 1e-9, "a decision hangs on rounding"
 
-    given = {k: getattr(settings, k) for k in ("gate_probability", "max_scan_age_s", "memory")}
-    manager = TrackManagerParams(**{k: getattr(settings, k) for k in TrackManagerParams.__dataclass_fields__})
+    given = {k: getattr(settings, k) for k in ("gate_probability", "max_scan_age_s", "memory", *IDENTITY[identity])}
+    manager = TrackManagerParams(
+        **{k: v for k, v in vars(settings).items() if k in TrackManagerParams.__dataclass_fields__}
+    )
     motion = MotionParams(noise_form="piecewise_constant", process_noise=settings.process_noise)
     rule_params = ArithmeticAverageParams(criterion="uniform") if rule is arithmetic_average else None
     fuser = centre(count, rule.__name__, rule_params, manager, motion, **given)
@@ -244,7 +264,7 @@ def test_a_scan_used_before_starts_nothing():
     )
     fuser.step(0, {0: tracks([[0, 0]], 0)})
     none = fuser.state.central[np.zeros(1, bool)]  # as if the track had been deleted
-    fuser.state = dataclasses.replace(fuser.state, central=none)
+    fuser.history = History.of(dataclasses.replace(fuser.state, central=none))
     fused, _ = fuser.step(SECOND, {})
     assert len(fused) == 0
 
@@ -252,7 +272,8 @@ def test_a_scan_used_before_starts_nothing():
 def test_a_scan_used_before_uses_up_no_identifier():
     fuser = centre(1, max_scan_age_s=10.0)
     fuser.step(0, {0: tracks([[0, 0]], 0)})
-    fuser.state = dataclasses.replace(fuser.state, central=fuser.state.central[np.zeros(1, bool)])
+    none = fuser.state.central[np.zeros(1, bool)]
+    fuser.history = History.of(dataclasses.replace(fuser.state, central=none))
     _, info = fuser.step(SECOND, {})
     assert info.changes.born.tolist() == info.changes.deleted.tolist() == []
     assert fuser.step(2 * SECOND, {0: tracks([[0, 0]], 2 * SECOND)})[0].track_id.tolist() == [2]
@@ -448,7 +469,8 @@ def test_a_sources_uuid_is_not_taken_for_the_central_tracks():
     uuid = np.arange(32, dtype=np.uint8).reshape(2, 16)
     batch = tracks([[0, 0], [50, 0]], 0).replace(uuid=uuid)
     fused, _ = centre().step(0, {0: batch, 1: tracks([[0, 0]], 0)})
-    assert fused.uuid is None
+    without, _ = centre().step(0, {0: batch.replace(uuid=None), 1: tracks([[0, 0]], 0)})
+    assert fused.uuid.tolist() == without.uuid.tolist()
 
 
 @pytest.mark.parametrize(

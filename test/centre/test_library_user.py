@@ -12,6 +12,7 @@ from track_fusion.centre.centre import FusionCentre
 from track_fusion.centre.config import (
     CentreConfig,
     FusionCentreParams,
+    IdentityParams,
     ScanBufferParams,
     SourceConfig,
     TrackManagerParams,
@@ -31,7 +32,8 @@ def fusion_centre(**buffer):
     rule, motion = RULES["covariance_intersection"], NearlyConstantVelocity(LAYOUT, MotionParams(process_noise=5.0))
     manager = TrackManagerParams(confirmation_threshold=(1, 1), max_coast_s=MAX_COAST_S)
     sources, params = (SourceConfig("a"), SourceConfig("b")), FusionCentreParams(max_scan_age_s=0.3)
-    config = CentreConfig(sources, motion, "map", rule, rule.params(), params, manager, ScanBufferParams(**buffer))
+    waits, identity = ScanBufferParams(**buffer), IdentityParams("test")
+    config = CentreConfig(sources, motion, "map", rule, rule.params(), params, manager, waits, identity=identity)
     return FusionCentre(config)
 
 
@@ -143,7 +145,7 @@ def test_a_large_one_starts_anew_and_identifiers_go_on_counting():
         (result,) = own.advance(now)
         assert (own.resets, result.tracks.track_id.tolist(), result.time_ns) == (resets, ids, now)
     own.reset()
-    assert (own.resets, own.state.central.next_id, own.buffer.silence_s(0, SECOND)) == (2, 4, -1.0)
+    assert (own.resets, own.state.central.identities.births, own.buffer.silence_s(0, SECOND)) == (2, 4, -1.0)
 
 
 def test_a_result_is_made_when_it_is_asked_for():
@@ -160,10 +162,10 @@ def test_a_result_is_made_when_it_is_asked_for():
 def test_what_was_kept_can_be_set_again():
     own, kept, results = fusion_centre(trigger="any_source"), [], []
     for k in range(1, 6):
-        kept.append((own.state, own.buffer))
+        kept.append((own.history, own.buffer))
         own.receive(k % 2, scan(k * SECOND, k), k * SECOND, k * SECOND)
         results += own.advance(k * SECOND)
-    own.state, own.buffer = kept[2]
+    own.history, own.buffer = kept[2]
     for k in range(3, 6):
         own.receive(k % 2, scan(k * SECOND, k), k * SECOND, k * SECOND)
         (again,) = own.advance(k * SECOND)

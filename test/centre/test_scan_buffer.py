@@ -139,10 +139,10 @@ def test_a_source_that_is_not_due_is_not_waited_for():
 
 def test_the_period_of_a_source_bears_lost_scans_and_jumps():
     buf = buffer(1, trigger="any_source")
-    assert functions.period_ns(buf.value.queues[0]) == 0
+    assert functions.period_ns(buf.value.queues[0].stamps) == 0
     for stamp in (100, 200, 300, 500, 600, 9000, 700):
         add(buf, 0, stamp, stamp if stamp < 9000 else 600)
-    assert functions.period_ns(buf.value.queues[0]) == 100 * MS
+    assert functions.period_ns(buf.value.queues[0].stamps) == 100 * MS
 
 
 def test_scans_of_a_stamp_that_was_published_are_taken_up_by_the_next_step():

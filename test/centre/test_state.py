@@ -9,8 +9,16 @@ import pytest
 from track_fusion import tracks as tracks_module
 from track_fusion.centre import pool as pool_module
 from track_fusion.centre.associate import Association, associate
-from track_fusion.centre.config import MAX_SOURCES, CentreConfig, FusionCentreParams, SourceConfig, TrackManagerParams
+from track_fusion.centre.config import (
+    MAX_SOURCES,
+    CentreConfig,
+    FusionCentreParams,
+    IdentityParams,
+    SourceConfig,
+    TrackManagerParams,
+)
 from track_fusion.centre.fuse import fuse
+from track_fusion.centre.links import Links
 from track_fusion.centre.pool import Pool, admitted
 from track_fusion.centre.state import CentreState
 from track_fusion.centre.step import step
@@ -31,7 +39,8 @@ def config(rule="covariance_intersection", sources=("a", "b"), **params):
     sources = tuple(s if isinstance(s, SourceConfig) else SourceConfig(s) for s in sources)
     manager = TrackManagerParams(confirmation_threshold=(1, 1), deletion_threshold=(2, 2))
     rule = RULES[rule]
-    return CentreConfig(sources, MOTION, "map", rule, rule.params(), FusionCentreParams(**params), manager)
+    own, identity = FusionCentreParams(**params), IdentityParams("test")
+    return CentreConfig(sources, MOTION, "map", rule, rule.params(), own, manager, identity=identity)
 
 
 def scan(rng, time_ns, count=3, components=1):
@@ -255,7 +264,7 @@ def test_the_mask_of_axes_is_all_true_and_goes_the_way_of_the_members():
     assert pool.has.all()
     has = np.random.default_rng(11).random(pool.has.shape) < 0.4
     pool = dataclasses.replace(pool, has=has)
-    association = associate(own, pool, fresh)
+    association = associate(own, pool, Links.none(), fresh)
     fused, _ = fuse(own, pool, association, None)
     assert len(fused.tracks) == 3
     assert not fused.has.all()
@@ -271,7 +280,7 @@ def test_a_coasting_track_keeps_its_mask():
     has = np.random.default_rng(12).random(pool.has.shape) < 0.5
     pool = dataclasses.replace(pool, has=has)
     nobody = np.zeros(0, np.intp)
-    fused, _ = fuse(own, pool, Association(nobody, nobody, 0, nobody), None)
+    fused, _ = fuse(own, pool, Association(nobody, nobody, 0, nobody, Links.none()), None)
     np.testing.assert_array_equal(fused.has, has[len(pool.source) :])
 
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from track_fusion.centre.config import CentreConfig, SourceConfig, TrackManagerParams
+from track_fusion.centre.config import CentreConfig, IdentityParams, SourceConfig, TrackManagerParams
 from track_fusion.centre.fuse import Fused
+from track_fusion.centre.identity import Identities
 from track_fusion.centre.manage import manage
 from track_fusion.centre.state import CentralTracks
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
@@ -22,8 +23,10 @@ class Life:
     def __init__(self, sources=2, **params):
         names = tuple(SourceConfig(str(k)) for k in range(sources))
         motion, rule = NearlyConstantVelocity(LAYOUT, MotionParams()), RULES["naive"]
-        self.central = CentralTracks.none(CentreConfig(names, motion, "map", rule, rule.params()))
+        config = CentreConfig(names, motion, "map", rule, rule.params())
+        self.central = CentralTracks.none(config, Identities.begun(IdentityParams("test")))
         self.params, self.sources, self.time = TrackManagerParams(**params), sources, 0
+        self.stamps = ((),) * sources
 
     def step(self, fresh, members, births=0, dt_s=0.1):
         """`members`: for each living track, then each newborn, the set of sources with a member in it."""
@@ -37,7 +40,7 @@ class Life:
         supported = np.array([self.time if m else -1 for m in members], np.int64)
         fresh = np.isin(np.arange(self.sources), list(fresh))
         fused = Fused(fused, np.ones((count, 4), bool))
-        self.central, changes = manage(self.params, self.central, fused, member, fresh, supported)
+        self.central, changes = manage(self.params, self.central, fused, member, fresh, supported, self.stamps)
         return changes
 
     @property

@@ -10,7 +10,13 @@ import pytest
 from track_fusion.angles import HALF_TURN, TURN, difference
 from track_fusion.association.gate import gate
 from track_fusion.centre.centre import FusionCentre
-from track_fusion.centre.config import CentreConfig, FusionCentreParams, SourceConfig, TrackManagerParams
+from track_fusion.centre.config import (
+    CentreConfig,
+    FusionCentreParams,
+    IdentityParams,
+    SourceConfig,
+    TrackManagerParams,
+)
 from track_fusion.centre.publish import StepInfo
 from track_fusion.models.base import Motion
 from track_fusion.models.constant_turn_rate_and_speed import ConstantTurnRateAndSpeed, TurnRateAndSpeedParams
@@ -33,7 +39,10 @@ def centre_of(motion: Motion, rule: str = "covariance_intersection", **params: A
     own = RULES[rule]
     manager = TrackManagerParams(confirmation_threshold=(1, 1))
     centre_params = FusionCentreParams(**params)
-    return FusionCentre(CentreConfig(sources, motion, "map", own, own.params(), centre_params, manager))
+    identity = IdentityParams("test")
+    return FusionCentre(
+        CentreConfig(sources, motion, "map", own, own.params(), centre_params, manager, identity=identity)
+    )
 
 
 def scan(layout: StateLayout, yaw: float, time_ns: int, **others: float) -> TrackBatch:

@@ -228,3 +228,49 @@ def test_the_search_misses_no_detection_in_a_gate(reach_m):
     assert gated.any()
     assert not (gated & ~found).any()
     assert found.sum() < 2 * gated.sum() + 50
+
+
+# ---- crowds ---------------------------------------------------------------------------------------------------------
+
+
+def crowd(rng, count, spread_m=50.0):
+    """Detections around one place."""
+    place = np.array([30e3, 20e3]) + rng.normal(size=(count, 2)) * spread_m
+    return RADAR.observe(np.concatenate([place, np.zeros((count, 2))], 1))
+
+
+def test_a_crowd_of_detections_begins_no_crowd_of_tracks():
+    """300 detections in one place made 90,000 tentative tracks of two scans."""
+    rng, one = np.random.default_rng(8), tracker()
+    for k in range(6):
+        one.step(int(k * SCAN_S * 1e9), crowd(rng, 300))
+        assert len(one.tracks.mean) <= 300 * max(k, 1)
+    assert one.tracks.dropped == 0
+
+
+def test_beside_a_crowd_a_lone_target_is_found_as_without():
+    rng, alone, beside = np.random.default_rng(9), tracker(), tracker()
+    for k in range(8):
+        state = np.array([[-40e3 + k * SCAN_S * 100.0, 5e3, 100.0, 0.0]])
+        seen, at_ns = RADAR.observe(state), int(k * SCAN_S * 1e9)
+        expected = alone.step(at_ns, seen)
+        got = beside.step(at_ns, np.concatenate([crowd(rng, 200), seen]))
+        near = np.linalg.norm(got.mean[:, 0, :2] - state[:, :2], axis=1) < 5e3
+        np.testing.assert_allclose(got.mean[near], expected.mean, rtol=1e-9)
+    assert len(expected) == 1
+
+
+def test_the_oldest_tentative_tracks_are_dropped_and_counted():
+    rng, one, free = np.random.default_rng(10), tracker(max_tentative_tracks=50), tracker()
+    for k, (_, detections) in enumerate(scene(rng, 4)):
+        one.step(int(k * SCAN_S * 1e9), detections)
+        free.step(int(k * SCAN_S * 1e9), detections)
+    assert (~free.tracks.confirmed).sum() > 50
+    assert (~one.tracks.confirmed).sum() == 50
+    assert one.tracks.dropped > 0
+    assert free.tracks.dropped == 0
+    assert one.tracks.next_id - one.tracks.track_id[~one.tracks.confirmed].min() < free.tracks.next_id - (
+        free.tracks.track_id[~free.tracks.confirmed].min()
+    )
+    one.reset()
+    assert one.tracks.dropped == 0

@@ -302,3 +302,52 @@ def test_memory_is_flat_over_an_hour(missing, count):
         others = result["targets"].pop("others")
         assert others["samples"] + sum(t["samples"] for t in result["targets"].values()) == 72_000
         assert others["targets"] + len(result["targets"]) == 3600
+
+
+def test_whole_pictures_are_scored():
+    """A track 3 m off for two times, then another one; a second target is missed, and a false track far away."""
+    judge = evaluation()
+    for stamp in range(4):
+        judge.add_truth(batch([(0, 0), (500, 0)], stamp, [1, 2]))
+        judge.add_tracks(stamp, batch([(3, 0), (200, 0)], stamp, [5 + stamp // 2, 9]))
+    scores = judge.result()["scores"]
+    assert (scores["times"], scores["cutoff_m"], scores["order"]) == (4, 10.0, 2.0)
+    assert scores["gospa_m"] == pytest.approx(np.sqrt(9 + 50 + 50))
+    parts = [scores[f"gospa_{part}_m"] for part in ("localisation", "missed", "false")]
+    assert parts == pytest.approx([3.0, np.sqrt(50), np.sqrt(50)])
+    assert scores["ospa_m"] == pytest.approx(np.sqrt((9 + 100) / 2))
+    assert (scores["id_switches"], scores["completeness"], scores["motp_m"]) == (1, 0.5, 3.0)
+    assert scores["mota"] == pytest.approx(1 - (4 + 4 + 1) / 8)
+    assert scores["idf1"] == pytest.approx(2 * 2 / 16)
+    assert evaluation().result()["scores"]["gospa_m"] is None
+
+
+def test_scores_leave_out_times_at_which_some_truth_is_unknown():
+    judge = Evaluation(LAYOUT, EvaluationParams(max_gap_s=1.0), whole_truth=False)
+    for k in range(10):
+        for i in (1, 2) if k != 9 else (1,):
+            judge.add_truth(moving(float(k), (i,)))
+        judge.add_tracks(k * SECOND, moving(float(k), (1, 2)))
+    scores = judge.result()["scores"]
+    assert (scores["times"], scores["gospa_m"], scores["mota"]) == (9, 0.0, 1.0)
+
+
+def test_latencies_are_told_by_quantiles():
+    rng, judge = np.random.default_rng(0), evaluation()
+    late_s = rng.exponential(0.02, 2000)
+    for k, seconds in enumerate(late_s):
+        judge.add_tracks(k, batch([], k), arrival_ns=k + round(seconds * SECOND))
+    told = judge.result()["latency"]
+    for name, share in (("p50_s", 50), ("p95_s", 95), ("p99_s", 99)):
+        assert told[name] == pytest.approx(np.percentile(late_s, share), rel=0.03)
+    assert (told["samples"], told["max_s"]) == (2000, pytest.approx(late_s.max(), rel=1e-6))
+    assert told["mean_s"] == pytest.approx(late_s.mean(), rel=1e-6)
+    assert evaluation().result()["latency"]["p95_s"] is None
+
+
+def test_extreme_latencies_are_told():
+    judge = evaluation()
+    for k, seconds in enumerate((-1.0, -1.0, 0.0, 1e6)):
+        judge.add_tracks(k, batch([], k), arrival_ns=k + round(seconds * SECOND))
+    told = judge.result()["latency"]
+    assert (told["p50_s"], told["max_s"]) == (0.0, pytest.approx(1e6))

@@ -23,6 +23,9 @@ AXES = ("x", "y", "vx", "vy")
 START_S = 60.0  # processes start slowly when the machine is busy
 STEP_S = 60.0  # far above what anything awaited here takes, on a busy machine too
 
+#: Identities of central tracks that are the same in every run.
+IDENTITY = "test"
+
 #: A centre in simulated time that runs a step only when all its sources are there: no wall clock in the result.
 PATIENT = {
     "use_sim_time": True,
@@ -33,6 +36,7 @@ PATIENT = {
     "max_delay_s": 1000.0,
     "max_future_s": 10.0,
     "expected_subscribers": 1,
+    "identity_namespace": IDENTITY,  # ids count from 1
 }
 
 

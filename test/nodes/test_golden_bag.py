@@ -29,6 +29,7 @@ from track_fusion.centre.centre import FusionCentre
 from track_fusion.centre.config import (
     CentreConfig,
     FusionCentreParams,
+    IdentityParams,
     ScanBufferParams,
     SourceConfig,
     TrackManagerParams,
@@ -165,7 +166,15 @@ def library_centre(oracle: str) -> FusionCentre:
     motion = NearlyConstantVelocity(StateLayout(tuple(given["layout"])), read_as(MotionParams))
     kinds = FusionCentreParams, TrackManagerParams, ScanBufferParams
     return FusionCentre(
-        CentreConfig(sources, motion, "map", rule, read_as(rule.params, f"{rule.key}."), *map(read_as, kinds))
+        CentreConfig(
+            sources,
+            motion,
+            "map",
+            rule,
+            read_as(rule.params, f"{rule.key}."),
+            *map(read_as, kinds),
+            identity=read_as(IdentityParams),
+        )  # fmt: skip
     )
 
 

@@ -18,6 +18,7 @@ import pytest
 from nav_msgs.msg import Odometry
 from nodes.support import (
     AXES,
+    IDENTITY,
     PATIENT,
     SECOND_NS,
     START_S,
@@ -40,7 +41,7 @@ from msg_adapters.header import stamp_from_ns
 from msg_adapters.odometry import odometry_from_msg, odometry_to_msgs
 from msg_adapters.track_table import track_table_to_msg
 from track_fusion.centre.centre import FusionCentre
-from track_fusion.centre.config import CentreConfig, SourceConfig, TrackManagerParams
+from track_fusion.centre.config import CentreConfig, IdentityParams, SourceConfig, TrackManagerParams
 from track_fusion.models.measurement import LinearSensor
 from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
 from track_fusion.params import Params
@@ -248,7 +249,8 @@ def bench(shared_domain: int, shared_probe: Probe) -> Iterator[Bench]:
 def reference(sources: int) -> FusionCentre:
     """The library's centre with the parameters of the nodes."""
     rule, names = RULES["covariance_intersection"], map(str, range(sources))
-    config = CentreConfig(tuple(map(SourceConfig, names)), MOTION, "map", rule, rule.params(), manager=MANAGER)
+    sources, identity = tuple(map(SourceConfig, names)), IdentityParams(IDENTITY)
+    config = CentreConfig(sources, MOTION, "map", rule, rule.params(), manager=MANAGER, identity=identity)
     return FusionCentre(config)
 
 

@@ -144,7 +144,12 @@ REFUSED: list[tuple[dict[str, Any], int, str]] = [
     ({"bag_topics": ["/clock"]}, 1, "The bag has no topic /clock."),
     ({"bag_remaps": ["/sensor_1/tracks"]}, 2, "The 'bag_remaps' parameter must hold 'from:=to'."),
     ({"bag_start_offset_s": 7.0, "expected_subscribers_each": 0}, 1, "The bag has no message after 7 s."),
-    ({"pace": "lockstep"}, 2, "The 'pace' parameter must be realtime with a bag. Got 'lockstep'."),
+    ({"bag_awaited": ["/x"], "pace": "lockstep"}, 1, "The bag has no topic /x. It has /sensor_1/tracks,"),
+    (
+        {"pace": "lockstep", "expected_subscribers_each": 0, "deadline_s": 0.5},
+        1,
+        "/processed has no publisher",
+    ),
     ({"rate": 0.0}, 2, "The 'rate' parameter must be a number > 0. Got 0.0."),
     ({"deadline_s": 0.5}, 1, "/sensor_1/tracks has no subscriber; /sensor_2/tracks has no subscriber"),
 ]

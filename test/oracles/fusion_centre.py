@@ -27,6 +27,9 @@ class Settings:
     max_coast_s: float
     process_noise: float  # standard deviation of an acceleration that is constant over a step, m/s^2
     memory: bool = False
+    keep_probability: float = 0.0  # of the gate of linked tracks, if wider
+    patience: int = 0
+    merge_duplicates: str = "off"
 
 
 def motion(dt, process_noise):
@@ -100,17 +103,32 @@ def covariance_intersection(members):
 # ---- the fusion centre, by doc/fusion-centre.md ------------------------------------------------------------------
 
 
-def associate(rows, tracks, gate_probability, margins):
-    """{index of row: index of track}, the candidates {(row, track): d2}; margins collects how close it was."""
-    gamma = float(chi2.ppf(gate_probability, 4))
+def gate(probability):
+    return float(chi2.ppf(probability, 4))
+
+
+def apart(row, track):
+    """Squared Mahalanobis distance, and the covariance of the difference."""
+    s, r = row["cov"] + track["cov"], row["mean"] - track["mean"]
+    return float(r @ np.linalg.inv(s) @ r), s
+
+
+def associate(rows, tracks, settings, margins, source=None):
+    """{index of row: index of track}, the candidates {(row, track): d2}; margins collects how close it was.
+
+    A row whose track_id a track knows as that of its `source` may lie out to the gate that is kept, and costs as just
+    inside the other.
+    """
+    gamma = gate(settings.gate_probability)
+    keep = max(gamma, gate(settings.keep_probability))
     d2, log_det = {}, {}
     for i, row in enumerate(rows):
         for j, track in enumerate(tracks):
-            s, r = row["cov"] + track["cov"], row["mean"] - track["mean"]
-            distance = float(r @ np.linalg.inv(s) @ r)
-            margins["gate"].append(abs(distance - gamma))
-            if distance <= gamma:
-                d2[i, j], log_det[i, j] = distance, math.log(np.linalg.det(s))
+            distance, s = apart(row, track)
+            limit = keep if (source, row["track_id"]) in track.get("links", ()) else gamma
+            margins["gate"].append(abs(distance - limit))
+            if distance <= limit:
+                d2[i, j], log_det[i, j] = min(distance, gamma * (1 - 1e-9)), math.log(np.linalg.det(s))
     miss = {}  # of each row that has a candidate
     for i in {i for i, _ in d2}:
         component = {pair for pair in d2 if pair[0] == i}
@@ -152,21 +170,84 @@ def join(parts, new, central, next_id, settings, margins):
     """Steps 3 and 4: each source by itself with the central tracks; what is left, with groups of earlier sources."""
     older, candidates = list(central), []
     for source, rows in parts.items():
-        pairs, d2 = associate(rows, older, settings.gate_probability, margins)
+        pairs, d2 = associate(rows, older, settings, margins, source)
         candidates += [(source, rows[i]["track_id"], older[j]["track_id"]) for i, j in d2]
         for i, j in pairs.items():
             older[j]["members"][source] = rows[i]
-        left = [row for i, row in enumerate(rows) if i not in pairs and source in new]
+        held = relink(source, rows, pairs, d2, older, source in new, settings)
+        left = [row for i, row in enumerate(rows) if i not in pairs and i not in held and source in new]
         groups = central[len(older) :]
-        pairs, _ = associate(left, groups, settings.gate_probability, margins)
+        pairs, _ = associate(left, groups, settings, margins)
         for i, row in enumerate(left):
             if i in pairs:
                 groups[pairs[i]]["members"][source] = row
+                groups[pairs[i]]["links"][source, row["track_id"]] = 0
                 continue
             group = {"track_id": next_id, "mean": row["mean"], "cov": row["cov"], "members": {source: row}}
+            group["links"] = {(source, row["track_id"]): 0}
             central.append(group | {"updates": {s: [] for s in settings.sources}, "confirmed": False})
             next_id += 1
     return candidates, next_id
+
+
+def relink(source, rows, pairs, d2, tracks, is_new, settings):
+    """The links of a source after its association, {(source, track_id): updates without part} in each central track.
+
+    Returns the indices of the rows that are held out: linked, but unassigned, and their patience not over.
+    """
+    held, shares = set(), settings.merge_duplicates == "also_within_a_source"
+    index = {row["track_id"]: i for i, row in enumerate(rows)}
+    for j, track in enumerate(tracks):
+        for own, track_id in [link for link in track["links"] if link[0] == source]:
+            i = index.get(track_id)
+            if i is not None and i in pairs:
+                del track["links"][own, track_id]
+            elif shares and (i, j) in d2:
+                track["links"][own, track_id] = 0
+                held.add(i)
+            else:
+                track["links"][own, track_id] += is_new
+                if track["links"][own, track_id] > settings.patience:
+                    del track["links"][own, track_id]
+                elif i is not None:
+                    held.add(i)
+    for i, j in pairs.items():
+        tracks[j]["links"][source, rows[i]["track_id"]] = 0
+    for track in tracks:  # one that is there drives out those that are not
+        own = {link for link in track["links"] if link[0] == source}
+        gone = {link for link in own if link[1] not in index}
+        if not shares and own - gone:
+            track["links"] = {link: idle for link, idle in track["links"].items() if link not in gone}
+    return held
+
+
+def unite(central, settings, close, margins):
+    """Step 8: what stays together and is told apart by no source becomes one. `close`: {pair of ids: steps}."""
+    if settings.merge_duplicates == "off":
+        return central
+    gamma, pairs = gate(0.99), {}
+    for older, younger in itertools.combinations(central, 2):
+        lately = [{s for s, updates in track["updates"].items() if any(updates[-3:])} for track in (older, younger)]
+        together = lately[0] & lately[1] and settings.merge_duplicates == "across_sources"
+        if all(lately) and not together:
+            distance = apart(older, younger)[0]
+            margins["gate"].append(abs(distance - gamma))
+            if distance <= gamma:
+                pair = older["track_id"], younger["track_id"]
+                pairs[pair] = close.get(pair, 0) + 1
+    close.clear()
+    close.update(pairs)
+    by_id, moves = {track["track_id"]: track for track in central}, {}
+    for pair, steps in sorted(pairs.items()):
+        first, second = (by_id[k] for k in pair)
+        lives, ends = (second, first) if second["confirmed"] and not first["confirmed"] else (first, second)
+        if steps >= 3:
+            moves.setdefault(ends["track_id"], lives["track_id"])
+    for ends, lives in moves.items():
+        if lives not in moves:
+            by_id[lives]["links"] |= by_id[ends]["links"]
+            central = [track for track in central if track["track_id"] != ends]
+    return central
 
 
 def fuse(track, rule, settings, *, existed):
@@ -192,7 +273,7 @@ def stays(track, new, t, settings):
 
 
 def published(track, sources):
-    """Step 8."""
+    """Step 9."""
     bits = sum(2**k for k, source in enumerate(sources) if source in track["members"])
     row = {"track_id": track["track_id"], "source": bits, "status": CONFIRMED + (0 if bits else COASTED)}
     return row | {"mean": track["mean"].tolist(), "cov": track["cov"].tolist()}
@@ -205,6 +286,7 @@ def run_centre(scans, rule, settings):
     """
     central, next_id, last_ns = [], 1, None
     used, steps, log, margins = set(), [], [], {"gate": [], "assignment": []}
+    close = {}
     for t in sorted({stamp_ns for source in settings.sources for stamp_ns, _ in scans[source]}):
         parts, new = take_scans(scans, t, used, settings)
         for track in central:
@@ -215,6 +297,7 @@ def run_centre(scans, rule, settings):
         for k, track in enumerate(central):
             fuse(track, rule, settings, existed=k < count)
         central = [track for track in central if stays(track, new, t, settings)]
+        central = unite(central, settings, close, margins)
         tracks = [published(track, settings.sources) for track in central if track["confirmed"]]
         steps.append({"stamp_ns": t, "tracks": tracks})
         members = {(s, m["track_id"]): track["track_id"] for track in central for s, m in track["members"].items()}

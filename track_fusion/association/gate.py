@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,11 @@ from track_fusion.angles import difference
 from track_fusion.linalg import Array
 
 Indices = NDArray[np.intp]
+Bools = NDArray[np.bool_]
 #: Up to so many pairs, all are tried: a tree would cost more than it saves.
 TRY_ALL = 4096
+#: Of more pairs than this, those whose positions lie too far apart are left out first, which costs little.
+TRY_EXACTLY = 64
 #: Exact gating works on pieces of so many pairs, to bound memory.
 PIECE = 65536
 #: Rows that one search of the tree looks for; each may be near every column.
@@ -44,6 +47,7 @@ def gate(
     gamma: float,
     position: tuple[int, ...],
     periods: Sequence[float] = (),
+    may: Callable[[Indices, Indices], Bools] | None = None,
 ) -> Candidates:
     """Find all pairs with (x_i - x_j)' (P_i + P_j)^-1 (x_i - x_j) <= gamma, differences the short way round.
 
@@ -54,6 +58,7 @@ def gate(
     gamma : float                 quantile of chi-square with n degrees of freedom
     position : tuple of int       axes that a spatial search may use, none that wraps; empty: try all pairs
     periods : (n,)                of axes that wrap, infinite for the others; empty: none wraps
+    may : function or None        of rows and columns of pairs, (P,) each: which of them are looked at; None: all
 
     Returns
     -------
@@ -61,21 +66,32 @@ def gate(
     """
     if len(row_mean) * len(col_mean) <= TRY_ALL or not position:
         row, col = np.divmod(np.arange(len(row_mean) * len(col_mean)), max(len(col_mean), 1))
-        pieces = [(row[i : i + PIECE], col[i : i + PIECE]) for i in range(0, max(len(row), 1), PIECE)]
-        return _joined([_exact(row_mean, row_cov, col_mean, col_cov, *piece, gamma, periods) for piece in pieces])
-    near = _near(row_mean, row_cov, col_mean, col_cov, gamma, list(position))
-    pairs = _joined([_exact(row_mean, row_cov, col_mean, col_cov, *piece, gamma, periods) for piece in near])
+        if position and len(row) > TRY_EXACTLY:
+            close = _is_close(row_mean, row_cov, col_mean, col_cov, gamma, list(position)).ravel()
+            row, col = row[close], col[close]
+        pieces = [_looked_at(row[i : i + PIECE], col[i : i + PIECE], may) for i in range(0, max(len(row), 1), PIECE)]
+        return joined(*(within(row_mean, row_cov, col_mean, col_cov, *piece, gamma, periods) for piece in pieces))
+    near = (_looked_at(*piece, may) for piece in _near(row_mean, row_cov, col_mean, col_cov, gamma, list(position)))
+    pairs = joined(*(within(row_mean, row_cov, col_mean, col_cov, *piece, gamma, periods) for piece in near))
     order = np.lexsort((pairs.col, pairs.row))
     return Candidates(pairs.row[order], pairs.col[order], pairs.distance[order], pairs.logdet[order])
 
 
-def _joined(parts: list[Candidates]) -> Candidates:
+def _looked_at(row: Indices, col: Indices, may: Callable[[Indices, Indices], Bools] | None) -> tuple[Indices, Indices]:
+    if may is None:
+        return row, col
+    at = may(row, col)
+    return row[at], col[at]
+
+
+def joined(*parts: Candidates) -> Candidates:
+    """Put candidates together, one after the other."""
     if len(parts) == 1:
         return parts[0]
     return Candidates(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Candidates)))
 
 
-def _exact(
+def within(
     row_mean: Array,
     row_cov: Array,
     col_mean: Array,
@@ -85,6 +101,7 @@ def _exact(
     gamma: float,
     periods: Sequence[float],
 ) -> Candidates:
+    """Those of the given pairs, row and col (P,), that lie within the gate, in their order; the rest as for `gate`."""
     residual = difference(row_mean[row], col_mean[col], periods)
     lower = np.linalg.cholesky(row_cov[row] + col_cov[col])
     white = np.linalg.solve(lower, residual[..., None])[..., 0]
@@ -92,6 +109,15 @@ def _exact(
     inside = np.flatnonzero(distance <= gamma)
     volume = 2.0 * np.log(np.diagonal(lower[inside], axis1=-2, axis2=-1)).sum(-1)
     return Candidates(row[inside], col[inside], distance[inside], volume)
+
+
+def _is_close(
+    row_mean: Array, row_cov: Array, col_mean: Array, col_cov: Array, gamma: float, position: list[int]
+) -> Bools:
+    """Tell which positions are close enough for the gate, (M, N): |dp|^2 <= gamma (trace of S), as in `_near`."""
+    gap = ((row_mean[:, None, position] - col_mean[:, position]) ** 2).sum(-1)
+    row_trace, col_trace = (cov[:, position, position].sum(-1) for cov in (row_cov, col_cov))
+    return np.asarray(gap <= gamma * (1.0 + 1e-9) * (row_trace[:, None] + col_trace))
 
 
 def _near(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Collection
 from contextlib import closing
 from pathlib import Path
@@ -42,11 +43,21 @@ def read_bag(path: Path, topics: Collection[str]) -> dict[str, list[Any]]:
     Fault    as open_bag
     """
     with closing(open_bag(path)) as reader:
-        from rosbags.typesys import Stores, get_typestore
-
-        store = get_typestore(Stores.ROS2_JAZZY)
         messages: dict[str, list[Any]] = {topic: [] for topic in topics}
         wanted = [connection for connection in reader.connections if connection.topic in messages]
         for connection, _, data in reader.messages(wanted) if wanted else ():  # to the package, none means all
-            messages[connection.topic].append(store.deserialize_cdr(data, connection.msgtype))
+            messages[connection.topic].append(deserialised(data, connection.msgtype))
         return messages
+
+
+def deserialised(data: bytes | memoryview, kind: str) -> Any:
+    """Return a message of a type of ROS 2 Jazzy, with the fields of that of ROS."""
+    return type_store().deserialize_cdr(data, kind)
+
+
+@functools.cache
+def type_store() -> Any:
+    """Return the types of ROS 2 Jazzy, and how they are serialised."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)

@@ -10,10 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from track_fusion.centre.config import CentreConfig, ScanBufferParams
+from track_fusion.centre.rhythm import STAMPS_KEPT, period_ns
 from track_fusion.tracks import SECOND_NS, TrackBatch
 
-#: So many stamps of a source tell its period: their median difference bears a few lost or jumping ones.
-STAMPS_KEPT = 9
 #: A source is due this share of a period after its last scan: stamps jitter.
 DUE_SHARE = 0.9
 
@@ -92,7 +91,6 @@ class Step(NamedTuple):
     kept_out : Counter     scans that take no part, by reason
     publish_ns : int       at which time its tracks are published
     late : tuple           source, scan and stamp of those that belong to the past, for retrodiction
-    predicted : int        how many more of them there are, among the scans or kept out
     """
 
     time_ns: int
@@ -100,13 +98,6 @@ class Step(NamedTuple):
     kept_out: Counter[str]
     publish_ns: int
     late: tuple[tuple[int, TrackBatch, int], ...] = ()
-    predicted: int = 0
-
-
-def period_ns(queue: Queue) -> int:
-    """Tell the period of a source, the median difference of its stamps, 0 = unknown yet."""
-    gaps = sorted(b - a for a, b in zip(queue.stamps, queue.stamps[1:], strict=False))
-    return gaps[len(gaps) // 2] if gaps else 0
 
 
 def add(
@@ -127,12 +118,16 @@ def add(
     -------
     ScanBuffer
     str or None    `stale_scan`, `out_of_order_scan`, `duplicate_scan`, `late_scan`, `duplicate_track_id` (of a piece
-                   those tracks alone are turned away that its scan has already)
+                   those tracks alone are turned away that its scan has already), `too_many_tracks` (of pieces put
+                   together, too; as if the source had not been heard)
     """
     queue = buffer.queues[source]
     reason = _refusal(config.buffer, buffer, queue, stamp_ns, now_ns)
     if reason is None:
         queue, reason = _taken_in(config, source, queue, Waiting(stamp_ns, now_ns, now_ns, scan))
+    most = config.sources[source].settings.max_tracks_per_scan
+    if reason is None and any(len(waiting.scan) > most for waiting in queue.waiting):
+        return buffer, "too_many_tracks"
     queues = list(buffer.queues)
     if reason is None:
         # The silence of sources that were never heard begins with the first scan of any.
@@ -153,7 +148,7 @@ def _refusal(params: ScanBufferParams, buffer: ScanBuffer, queue: Queue, stamp_n
 
 
 def _taken_in(config: CentreConfig, source: int, queue: Queue, new: Waiting) -> tuple[Queue, str | None]:
-    """Sort a scan in, or put a piece to the scan whose stamp it bears; retrodiction puts it to one that was taken."""
+    """Sort a scan in, or put a piece to the scan whose stamp it bears; retrodiction puts it to one that was fused."""
     assembles = config.sources[source].assembles
     ids = frozenset(new.scan.track_id.tolist()) if assembles else frozenset[int]()
     newest = queue.stamps[-1] if queue.stamps else -1
@@ -184,25 +179,38 @@ def _joined(queue: Queue, scan: Waiting, piece: Waiting) -> tuple[Queue, str | N
     return dataclasses.replace(queue, waiting=waiting), reason
 
 
-def advance(
-    config: CentreConfig, buffer: ScanBuffer, now_ns: int, living: bool, may_rewind: bool = True
-) -> tuple[ScanBuffer, Step | None]:
+def predicted(config: CentreConfig, step: Step) -> Step:
+    """Take the late scans of a step as new ones: the newest of each source that brings no other, if not too old."""
+    scans, kept_out = dict(step.scans), Counter(step.kept_out)
+    for source, scan, stamp_ns in sorted(step.late, key=lambda late: late[2], reverse=True):
+        if source in scans:
+            kept_out["superseded_scan"] += 1
+        elif _is_aged(config, step.time_ns, stamp_ns):
+            kept_out["aged_scan"] += 1
+        else:
+            scans[source] = scan
+    return step._replace(scans=scans, kept_out=kept_out, late=())
+
+
+def _is_aged(config: CentreConfig, time_ns: int, stamp_ns: int) -> bool:
+    return time_ns - stamp_ns > config.params.max_scan_age_s * SECOND_NS
+
+
+def advance(config: CentreConfig, buffer: ScanBuffer, now_ns: int, living: bool) -> tuple[ScanBuffer, Step | None]:
     """Return the next step that may run, or None; the times of steps strictly increase.
 
     When all sources have been silent for `source_timeout_s`, a step runs as often, so that tracks coast.
 
     Parameters
     ----------
-    living : bool        whether there are central tracks
-    may_rewind : bool    whether late scans are handed out for retrodiction, where the parameters ask for it; else they
-                         are predicted
+    living : bool    whether there are central tracks
     """
     buffer = dataclasses.replace(buffer, now_ns=now_ns)
     time_ns = _tick(config, buffer, now_ns) if config.buffer.trigger == "rate" else _due(config, buffer, now_ns)
     idle = now_ns - buffer.fused_ns >= config.buffer.source_timeout_s * SECOND_NS
     if time_ns is None and living and idle and all_silent(config, buffer, now_ns):
         time_ns = now_ns
-    return (buffer, None) if time_ns is None else _taken(config, buffer, time_ns, now_ns, may_rewind)
+    return (buffer, None) if time_ns is None else _taken(config, buffer, time_ns, now_ns)
 
 
 def all_silent(config: CentreConfig, buffer: ScanBuffer, now_ns: int) -> bool:
@@ -211,12 +219,14 @@ def all_silent(config: CentreConfig, buffer: ScanBuffer, now_ns: int) -> bool:
 
 
 def wake_ns(config: CentreConfig, buffer: ScanBuffer, now_ns: int) -> int | None:
-    """Return when time alone may make a step due, coasting aside; None: only another scan can."""
+    """Return when time alone may make a step due; None: only another scan can."""
     return min((time_ns for time_ns in _deadlines(config, buffer, now_ns) if time_ns > now_ns), default=None)
 
 
 def _deadlines(config: CentreConfig, buffer: ScanBuffer, now_ns: int) -> Iterator[int]:
-    params = config.buffer
+    params, timeout_ns = config.buffer, round(config.buffer.source_timeout_s * SECOND_NS)
+    heard = [queue.heard_ns for queue in buffer.queues if queue.heard_ns >= 0]
+    yield from (since_ns + timeout_ns for since_ns in (*heard, *([buffer.fused_ns] if heard else ())))
     if params.trigger == "rate":
         period = round(SECOND_NS / params.output_rate_hz)
         yield (now_ns // period + 1) * period
@@ -288,7 +298,7 @@ def _is_complete(config: CentreConfig, buffer: ScanBuffer, time_ns: int, now_ns:
 
 
 def _is_due(queue: Queue, newest_ns: int, time_ns: int) -> bool:
-    period = period_ns(queue)
+    period = period_ns(queue.stamps)
     return period > 0 and time_ns - newest_ns >= DUE_SHARE * period
 
 
@@ -302,15 +312,12 @@ def _in_pieces(params: ScanBufferParams, queue: Queue, time_ns: int, now_ns: int
     return not all_there and now_ns - queue.waiting[-1].touched_ns < params.assembly_window_s * SECOND_NS
 
 
-def _taken(
-    config: CentreConfig, buffer: ScanBuffer, time_ns: int, now_ns: int, may_rewind: bool
-) -> tuple[ScanBuffer, Step]:
+def _taken(config: CentreConfig, buffer: ScanBuffer, time_ns: int, now_ns: int) -> tuple[ScanBuffer, Step]:
     """Take the scans of a step: of each source the newest one up to its time, and the late ones for retrodiction."""
-    params, past_ns = config.buffer, buffer.fused_ns if config.retrodicts else -1
+    params, past_ns = config.buffer, buffer.fused_ns if config.buffer.out_of_sequence == "retrodict" else -1
     scans: dict[int, TrackBatch] = {}
     kept_out: Counter[str] = Counter()
     late: list[tuple[int, TrackBatch, int]] = []
-    predicted = 0
     queues = list(buffer.queues)
     for k, queue in enumerate(buffer.queues):
         due = [w for w in queue.waiting if w.stamp_ns <= time_ns]
@@ -318,20 +325,15 @@ def _taken(
             due = due[:-1]
         if not due:
             continue
-        past, new = [w for w in due if w.stamp_ns <= past_ns], [w for w in due if w.stamp_ns > past_ns]
-        if may_rewind:
-            late += [(k, w.scan, w.stamp_ns) for w in past]
-        else:  # as those are that `predict` lets in
-            usable = [w for w in past if w.stamp_ns > queue.taken_ns]
-            kept_out["out_of_order_scan"] += len(past) - len(usable)
-            predicted, new = predicted + len(past), usable + new
+        late += [(k, w.scan, w.stamp_ns) for w in due if w.stamp_ns <= past_ns]
+        new = [w for w in due if w.stamp_ns > past_ns]
         kept_out["superseded_scan"] += max(len(new) - 1, 0)
-        if new and time_ns - new[-1].stamp_ns > config.params.max_scan_age_s * SECOND_NS:
+        if new and _is_aged(config, time_ns, new[-1].stamp_ns):
             kept_out["aged_scan"] += 1
         elif new:
             scans[k] = new[-1].scan
         taken_ns = max(queue.taken_ns, due[-1].stamp_ns)
         queues[k] = dataclasses.replace(queue, waiting=queue.waiting[len(due) :], taken_ns=taken_ns)
     publish_ns = time_ns if params.publish_at == "stamp" else max(now_ns, time_ns, buffer.published_ns + 1)
-    step = Step(time_ns, scans, +kept_out, publish_ns, tuple(late), predicted)
+    step = Step(time_ns, scans, +kept_out, publish_ns, tuple(late))
     return ScanBuffer(tuple(queues), time_ns, now_ns, publish_ns, now_ns), step

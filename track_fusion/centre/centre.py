@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 from track_fusion.centre import buffer
-from track_fusion.centre.buffer import ScanBuffer
+from track_fusion.centre.buffer import ScanBuffer, Step
 from track_fusion.centre.config import CentreConfig
 from track_fusion.centre.history import History, Late, Rewound, forward, rewind
 from track_fusion.centre.pool import predicted_to
 from track_fusion.centre.publish import StepInfo
 from track_fusion.centre.state import CentreState
-from track_fusion.tracks import TrackBatch
+from track_fusion.tracks import SECOND_NS, TrackBatch
 
 
 class Published(NamedTuple):
@@ -23,12 +23,12 @@ class Published(NamedTuple):
 
     Attributes
     ----------
-    time_ns : int              for which the tracks are published; strictly increasing
-    tracks : TrackBatch
-    info : StepInfo            what happened in the step
-    kept_out : Counter         scans that take no part, by reason
-    rewound : Rewound, None    what was repeated before it, for scans that had come late
-    predicted : int            late scans for which nothing was repeated, since that had taken its share of the time
+    time_ns : int
+    tracks : TrackBatch         to be published, at that time
+    info : StepInfo             what happened
+    kept_out : Counter          scans that took no part, by reason
+    rewound : Rewound or None   what was repeated before the step for scans that came late
+    beyond_share : int          late scans that were predicted instead, `max_rewind_share` being used up
     """
 
     time_ns: int
@@ -36,25 +36,7 @@ class Published(NamedTuple):
     info: StepInfo
     kept_out: Counter[str]
     rewound: Rewound | None = None
-    predicted: int = 0
-
-
-class Debt(NamedTuple):
-    """What rewinds owe: while they owe nothing one may begin; they pay with their share of the time that goes by.
-
-    So they take no more than that share of any long time, of a short one no more than one rewind beyond it.
-    """
-
-    owed_s: float = 0.0
-    seen_s: float = 0.0
-
-    def at(self, now_s: float, share: float) -> Debt:
-        """Return what is owed at a time."""
-        return Debt(max(0.0, self.owed_s - share * (now_s - self.seen_s)), now_s)
-
-    def with_rewind(self, took_s: float) -> Debt:
-        """Add a rewind that began at the time of this debt."""
-        return Debt(self.owed_s + took_s, self.seen_s)
+    beyond_share: int = 0
 
 
 class FusionCentre:
@@ -65,43 +47,39 @@ class FusionCentre:
 
     doc/fusion-centre.md has an example.
 
-    Attributes
-    ----------
-    config : CentreConfig
-    history : History        the state and, with retrodiction, the last steps; a value: keep it, set it to go back
-    buffer : ScanBuffer      likewise
-    resets : int             how often the clock was seen to step back further than is ridden out
-
     Parameters
     ----------
     config : CentreConfig
-    clock : callable    tells the seconds by which the time that rewinds take is measured; one that stands still lets
-                        all of them through, so that results do not depend on the machine
+    timer : function    seconds, of any zero: how long repeating steps takes (`max_rewind_share`)
+
+    Attributes
+    ----------
+    config : CentreConfig
+    history : History        a value: keep it, and set it again to go back; holds the state, and the last steps where
+                             late scans make the centre repeat them
+    buffer : ScanBuffer      likewise
+    resets : int             how often the clock was seen to step back further than is ridden out
     """
 
-    def __init__(self, config: CentreConfig, clock: Callable[[], float] = time.monotonic) -> None:
-        self.config, self.resets, self._clock, self._debt = config, 0, clock, Debt()
+    def __init__(self, config: CentreConfig, timer: Callable[[], float] = time.perf_counter) -> None:
+        self.config, self.resets, self._timer = config, 0, timer
         self.history, self.buffer = History.of(CentreState.initial(config)), ScanBuffer.empty(config)
+        self._allowance_s, self._told_ns = self._most_s, -1
 
     def reset(self) -> None:
-        """Forget all tracks and scans; identifiers go on counting."""
-        fresh = CentreState.initial(self.config)
-        central = dataclasses.replace(fresh.central, next_id=self.history.next_id)
-        self.state, self.buffer = dataclasses.replace(fresh, central=central), ScanBuffer.empty(self.config)
+        """Forget all tracks and scans; identities go on, so that none is given again."""
+        given = self.state.central.identities._replace(births=self.history.next_id)
+        self.history, self.buffer = History.of(CentreState.initial(self.config, given)), ScanBuffer.empty(self.config)
 
     @property
     def state(self) -> CentreState:
-        """The state, which with retrodiction has numbers of its own; who sets it forgets the steps before it."""
+        """What the next step begins with; tracks are numbered in it as if all scans had come in time."""
         return self.history.present.state
-
-    @state.setter
-    def state(self, state: CentreState) -> None:
-        self.history = History.of(state)
 
     @property
     def tracks(self) -> TrackBatch:
         """All living central tracks, tentative ones included."""
-        return self.history.present.tracks
+        return self.history.present.known(self.state.central.tracks)
 
     def step(self, time_ns: int, scans: Mapping[int, TrackBatch]) -> tuple[TrackBatch, StepInfo]:
         """Fuse at one time; see :func:`track_fusion.centre.step.step`."""
@@ -110,30 +88,49 @@ class FusionCentre:
         return published, info
 
     def receive(self, source: int, scan: TrackBatch, stamp_ns: int, now_ns: int) -> str | None:
-        """Take in a scan; return None, or why it was turned away: see :func:`track_fusion.centre.buffer.add`."""
+        """Take in a scan; return None, or why it was turned away: see :func:`track_fusion.centre.buffer.add`.
+
+        Here its stamps, as the source tells them, become those of the centre's clock: later by its `time_offset_s`.
+        """
         self._heed(now_ns)
-        self.buffer, reason = buffer.add(self.config, self.buffer, source, scan, stamp_ns, now_ns)
+        offset_ns = self.config.sources[source].settings.time_offset_ns
+        scan = scan.replace(time_ns=scan.time_ns + offset_ns) if offset_ns else scan
+        self.buffer, reason = buffer.add(self.config, self.buffer, source, scan, stamp_ns + offset_ns, now_ns)
         return reason
 
     def advance(self, now_ns: int) -> Iterator[Published]:
         """Run the steps that are due by now, one whenever the next result is asked for."""
         self._heed(now_ns)
         while True:
-            self._debt = self._debt.at(self._clock(), self.config.buffer.max_rewind_share)
-            living, may_rewind = len(self.state.central) > 0, self._debt.owed_s == 0.0
-            self.buffer, due = buffer.advance(self.config, self.buffer, now_ns, living, may_rewind)
+            living = len(self.state.central) > 0
+            self.buffer, due = buffer.advance(self.config, self.buffer, now_ns, living)
             if due is None:
                 return
-            rewound = self._rewind(due.late) if due.late else None
-            kept_out = due.kept_out if rewound is None else due.kept_out + rewound.kept_out
-            tracks, info = self.step(due.time_ns, due.scans)
-            shown = self._shown(tracks, due.publish_ns)
-            yield Published(due.publish_ns, shown, info, kept_out, rewound, due.predicted)
+            rewound = self._rewound(due, now_ns) if due.late else None
+            beyond_share = 0 if rewound else len(due.late)
+            own = buffer.predicted(self.config, due) if beyond_share else due
+            kept_out = own.kept_out + rewound.kept_out if rewound else own.kept_out
+            tracks, info = self.step(own.time_ns, own.scans)
+            tracks = self._shown(tracks, own.publish_ns)
+            yield Published(own.publish_ns, tracks, info, kept_out, rewound, beyond_share)
 
-    def _rewind(self, late: tuple[tuple[int, TrackBatch, int], ...]) -> Rewound:
-        """Repeat the steps since the late scans, which have waited for this next step: one rewind for all of them."""
-        self.history, rewound = rewind(self.config, self.history, [Late(*one) for one in late])
-        self._debt = self._debt.with_rewind(self._clock() - self._debt.seen_s)
+    @property
+    def _most_s(self) -> float:
+        return self.config.buffer.max_rewind_share * self.config.buffer.history_length_s
+
+    def _rewound(self, due: Step, now_ns: int) -> Rewound | None:
+        """Repeat steps for late scans, if the share of the time that this may take allows it."""
+        share = self.config.buffer.max_rewind_share
+        if self._told_ns >= 0:
+            passed_s = max(now_ns - self._told_ns, 0) / SECOND_NS
+            self._allowance_s = min(self._allowance_s + share * passed_s, self._most_s)
+        self._told_ns = now_ns
+        if share < 1.0 and self._allowance_s <= 0.0:
+            return None
+        began_s = self._timer()
+        late = (Late(source, scan, stamp_ns) for source, scan, stamp_ns in due.late)
+        self.history, rewound = rewind(self.config, self.history, late)
+        self._allowance_s -= self._timer() - began_s
         return rewound
 
     def wake_ns(self, now_ns: int) -> int | None:

@@ -17,10 +17,12 @@ from track_fusion.plugins import Registry
 from track_fusion.random_streams import RandomParams
 from track_fusion.rules import RULES, Rule, SourceTracks
 from track_fusion.solvers.chi_square import chi_square_quantile
-from track_fusion.tracks import StateLayout
+from track_fusion.tracks import SECOND_NS, StateLayout
 
 #: Provenance has 32 bits.
 MAX_SOURCES = 32
+#: No clock is further off: 32 bits of seconds.
+MAX_OFFSET_S = 2.0**32
 #: Updates that a history remembers: its width in bits.
 HISTORY_BITS = 32
 
@@ -46,16 +48,32 @@ class FusionCentreParams(Params):
 
     association: str = param(
         "nearest",
-        "nearest: global nearest neighbour within the gate; single_target: all sources are known to track one and the "
+        "nearest: global nearest neighbour within the gates; single_target: all sources are known to track one and the "
         "same target, so that the first track of each is taken without a gate",
         choices=("nearest", "single_target"),
     )
     gate_probability: float = param(
-        0.99,
+        0.9999,
         "share of true pairs of tracks inside the gate (chi-square over all axes)",
         low=0.0,
         high=1.0 - 1e-12,
         strict=True,
+    )
+    keep_probability: float = param(
+        1.0 - 1e-6,
+        "the same for a source track and the central track that it fed last, if wider",
+        low=0.0,
+        high=1.0 - 1e-12,
+        strict=True,
+    )
+    patience: int = param(
+        5, "updates in a row that a source track beyond that gate is held out before it starts a track", low=0
+    )
+    merge_duplicates: str = param(
+        "across_sources",
+        "make one of two central tracks that stay together: where no source supports both, even where one does "
+        "(a source that splits targets), or never",
+        choices=("across_sources", "also_within_a_source", "off"),
     )
     max_scan_age_s: float = param(
         0.5, "a source's newest scan takes part, predicted, until it is older than this", unit="s", low=0.0
@@ -120,8 +138,8 @@ class ScanBufferParams(Params):
     max_delay_s: float = param(10.0, "a scan older than this on arrival is rejected", unit="s", low=0.0, strict=True)
     out_of_sequence: str = param(
         "predict",
-        "a scan that is no later than the last step: neglect it; predict it to the next one as its source's newest; "
-        "or retrodict, repeat the steps since its stamp (needs memory: true)",
+        "a scan that is no later than the last step: neglect it; predict it to the next one as its source's newest; or "
+        "retrodict: repeat the steps since its stamp (needs memory: true)",
         choices=("neglect", "predict", "retrodict"),
     )
     history_length_s: float = param(
@@ -153,7 +171,15 @@ class TrackManagerParams(Params):
         high=HISTORY_BITS,
     )
     max_coast_s: float = param(
-        5.0, "delete a track that no source supported for so long", unit="s", low=0.0, strict=True
+        0.0,
+        "delete a track that no source supported for so long; 0: three periods of the slowest source that ever did, at "
+        "least 5 s",
+        unit="s",
+        low=0.0,
+    )
+    confirmation_sources: int = param(1, "how many sources it takes to confirm a track, each by M of N", low=1)
+    max_tentative_tracks: int = param(
+        20_000, "keep at most so many tracks that are not confirmed; the oldest are dropped and counted", low=1
     )
 
     def __post_init__(self) -> None:
@@ -162,6 +188,46 @@ class TrackManagerParams(Params):
             value = getattr(self, name)
             if len(value) != 2 or value[0] > value[1]:
                 raise ParameterError(f"The '{name}' parameter must be two integers, the first not larger. Got {value}.")
+
+
+@dataclasses.dataclass(frozen=True)
+class IdentityParams(Params):
+    """What central tracks are called."""
+
+    identity_namespace: str = param(
+        "",
+        "name from which the UUIDs of central tracks are made, ids counting from 1: the same in every run; empty: a "
+        "namespace drawn at start, ids counting from a number made from the time, so that no restart gives one again",
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class SourceSettings(Params):
+    """What is declared of one source."""
+
+    can_initiate: bool = param(True, "whether its tracks start central tracks")
+    covariance_scale: float = param(
+        1.0, "its covariances are multiplied by this (above 1: it claims too much)", low=0.0, high=1e6, strict=True
+    )
+    bias_sd: float = param(
+        0.0,
+        "standard deviation of its bias along each position axis, added to its covariances after scaling",
+        unit="m",
+        low=0.0,
+        high=1e6,
+    )
+    time_offset_s: float = param(
+        0.0, "added to its stamps: how far its clock is behind", unit="s", low=-MAX_OFFSET_S, high=MAX_OFFSET_S
+    )
+    max_tracks_per_scan: int = param(20_000, "a scan of more tracks is turned away whole (too_many_tracks)", low=1)
+    is_self_reported: bool = param(
+        True, "whether its tracks hold what it sensed itself and no more; false: they count as shared provenance"
+    )
+
+    @property
+    def time_offset_ns(self) -> int:
+        """The same in nanoseconds."""
+        return round(self.time_offset_s * SECOND_NS)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -173,11 +239,13 @@ class SourceConfig:
     name : str
     assembles : bool               its scans arrive piece by piece (one message a track)
     transform : Transform or None  from its axes and frame to the centre's; None = it has those of the centre
+    settings : SourceSettings
     """
 
     name: str
     assembles: bool = False
     transform: Transform | None = None
+    settings: SourceSettings = SourceSettings()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -195,13 +263,15 @@ class CentreConfig:
     manager : TrackManagerParams
     buffer : ScanBufferParams
     random : RandomParams              what rules that sample draw from, step after step
+    identity : IdentityParams
     clock : ClockParams                how far the clocks may be trusted
 
     Raises
     ------
     ParameterError    too many sources; the rule needs what source tracks do not bring, such as their
-                      cross-covariance; weights are given that do not fit the sources; not one number an axis in
-                      `particle_variances`; retrodiction without memory; a transform does not bring every axis
+                      cross-covariance; `confirmation_sources` exceeds them; weights are given that do not fit the
+                      sources; not one number an axis in `particle_variances`; retrodiction without memory; a transform
+                      does not bring every axis of the centre
     """
 
     sources: tuple[SourceConfig, ...]
@@ -213,11 +283,17 @@ class CentreConfig:
     manager: TrackManagerParams = TrackManagerParams()
     buffer: ScanBufferParams = ScanBufferParams()
     random: RandomParams = RandomParams(role="fusion_centre")
+    identity: IdentityParams = IdentityParams()
     clock: ClockParams = ClockParams()
 
     def __post_init__(self) -> None:
         if len(self.sources) > MAX_SOURCES:
             raise ParameterError(f"The 'sources' must be at most {MAX_SOURCES}. Got {len(self.sources)}.")
+        if self.manager.confirmation_sources > max(len(self.sources), 1):
+            raise ParameterError(
+                f"The 'confirmation_sources' parameter must be at most {len(self.sources)}, the number of sources. "
+                f"Got {self.manager.confirmation_sources}."
+            )
         needed = sorted(set(self.rule.needed(self.rule_params)) - _AT_HAND)
         if needed:
             raise ParameterError(
@@ -274,6 +350,11 @@ class CentreConfig:
         return chi_square_quantile(self.params.gate_probability, self.layout.size)
 
     @cached_property
+    def keep_gamma(self) -> float:
+        """The gate of linked tracks, not narrower than the other."""
+        return max(self.gamma, chi_square_quantile(self.params.keep_probability, self.layout.size))
+
+    @cached_property
     def floor(self) -> Array:
         """What is added to the covariance of particles, (n, n)."""
         return np.diag(self.params.particle_variances or np.zeros(self.layout.size))
@@ -299,6 +380,11 @@ class CentreConfig:
     def retrodicts(self) -> bool:
         """Whether a late scan makes the centre repeat its last steps."""
         return self.buffer.out_of_sequence == "retrodict"
+
+    @cached_property
+    def can_initiate(self) -> NDArray[np.bool_]:
+        """Which sources start central tracks, (S,)."""
+        return np.array([source.settings.can_initiate for source in self.sources], bool)
 
     @cached_property
     def draws(self) -> bool:

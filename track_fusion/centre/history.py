@@ -54,10 +54,12 @@ class Named(NamedTuple):
     state: CentreState
     ids: Ids
 
-    @property
-    def tracks(self) -> TrackBatch:
-        """All living central tracks, as readers know them."""
-        return self.state.central.tracks.replace(track_id=self.ids)
+    def known(self, tracks: TrackBatch) -> TrackBatch:
+        """Give some of the state's tracks the identities by which readers know them."""
+        ids = _exchanged(self.state.central.tracks.track_id, self.ids, tracks.track_id)
+        if np.array_equal(ids, tracks.track_id):
+            return tracks
+        return tracks.replace(track_id=ids, uuid=self.state.central.identities.uuids(ids.tolist()))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -102,17 +104,12 @@ class History:
     @classmethod
     def of(cls, state: CentreState) -> History:
         """Begin at a state."""
-        return cls(Named(state, state.central.tracks.track_id), (), state.central.next_id)
+        return cls(Named(state, state.central.tracks.track_id), (), state.central.identities.births)
 
     @property
     def begin_ns(self) -> int:
         """A scan stamped later than this finds its place."""
         return (self.kept[0].before if self.kept else self.present).state.time_ns
-
-    @property
-    def length_s(self) -> float:
-        """Seconds over which steps can be repeated."""
-        return (self.present.state.time_ns - self.kept[0].time_ns) / SECOND_NS if self.kept else 0.0
 
 
 class Rewound(NamedTuple):
@@ -122,7 +119,8 @@ class Rewound(NamedTuple):
     ----------
     repeated : int               steps that ran again, or anew for a late scan
     vanished : (N,)              identifiers of published tracks that are no more
-    kept_out : {reason: count}   late scans: `older_than_history`, `duplicate_scan`, `superseded_scan`
+    kept_out : {reason: count}   late scans: `older_than_history`, `duplicate_scan`, `superseded_scan`,
+                                 `duplicate_track_id` (pieces of one)
     """
 
     repeated: int
@@ -199,16 +197,16 @@ def _stepped(
     born = info.changes.born
     own_ids = np.concatenate([before.state.central.tracks.track_id, born])
     named = partial(_exchanged, own_ids, np.concatenate([before.ids, next_id + np.arange(len(born))]))
-    changes = Changes(named(born), named(info.changes.confirmed), named(info.changes.deleted))
-    info = dataclasses.replace(info, changes=changes, fed=info.fed._replace(central=named(info.fed.central)))
-    published = published.replace(track_id=named(published.track_id))
-    return Named(state, named(state.central.tracks.track_id)), published, info
+    changes = Changes(*map(named, vars(info.changes).values()))
+    fed = info.fed._replace(central=named(info.fed.central))
+    info = dataclasses.replace(info, changes=changes, fed=fed, merged=named(info.merged))
+    present = Named(state, named(state.central.tracks.track_id))
+    return present, present.known(published), info
 
 
 def _exchanged(words: Ids, meanings: Ids, ids: Ids) -> Ids:
-    """Exchange identifiers, each one of the words, for their meanings."""
-    order = np.argsort(words, kind="stable")
-    meant = np.asarray(meanings[order[np.searchsorted(words, ids, sorter=order)]])
+    """Exchange identifiers, each one of the words, which ascend, for their meanings."""
+    meant = np.asarray(meanings[np.searchsorted(words, ids)])
     meant.setflags(write=False)
     return meant
 
@@ -297,7 +295,8 @@ def _founders(info: StepInfo) -> dict[Sighting, int]:
 
 
 def _published_ids(config: CentreConfig, present: Named) -> Ids:
-    return publish(config.params, present.tracks).track_id
+    tracks = present.state.central.tracks
+    return publish(config.params, tracks.replace(track_id=present.ids)).track_id
 
 
 def _named(course: History, claims: set[Claim], seen: set[int], next_id: int) -> History:

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from track_fusion.angles import wrap
 from track_fusion.centre.config import CentreConfig
+from track_fusion.centre.declared import as_declared, bare
+from track_fusion.centre.links import key_of
 from track_fusion.centre.state import Bools, CentralTracks
 from track_fusion.filters.base import Gaussian
 from track_fusion.filters.extended import Extended
@@ -43,7 +45,8 @@ def admitted(
         scan = scan if keep.all() else scan[keep]
         transform = config.sources[source].transform
         brought = scan if transform is None else transform(scan, config.layout, config.frame_id)
-        held[source] = brought.replace(uuid=None, mean=wrap(brought.mean, config.layout.periods)).owned()
+        own = brought.replace(uuid=None, mean=wrap(brought.mean, config.layout.periods))
+        held[source] = as_declared(config, source, own).owned()
     return tuple(held)
 
 
@@ -104,7 +107,7 @@ class Pool:
             k: scan for k, scan in enumerate(newest)
             if scan is not None and (fresh[k] or not config.params.memory) and _is_young(config, scan, time_ns)
         }  # fmt: skip
-        before = [*scans.values(), central.tracks]
+        before = [*scans.values(), central.tracks.replace(uuid=None)]  # an identity takes no part in a fusion
         after = [predicted_to(batch, time_ns, config.motion) for batch in before]
         tracks = TrackBatch.concatenate(after)
         mean, cov = tracks.moments
@@ -113,16 +116,21 @@ class Pool:
             sound = conditioned(cov, np.concatenate([batch.well_conditioned[:, 0] for batch in after]))
             tracks = tracks.replace(cov=sound[:, None])
         else:
-            particles, bare = np.concatenate([_bare(batch) for batch in before]), _bare(tracks)
-            cov = np.where(bare[:, None, None], cov + config.floor, cov)
+            particles, point = np.concatenate([bare(batch) for batch in before]), bare(tracks)
+            cov = np.where(point[:, None, None], cov + config.floor, cov)
             sound = conditioned(cov, is_well_conditioned(cov))
-            tracks = tracks.replace(cov=conditioned(tracks.cov, tracks.well_conditioned | bare[:, None]))
+            tracks = tracks.replace(cov=conditioned(tracks.cov, tracks.well_conditioned | point[:, None]))
         source = np.repeat(np.fromiter(scans, np.intp), [len(scan) for scan in scans.values()])
         stamp_ns = np.concatenate([batch.time_ns for batch in before])[: len(source)]
         bit = np.zeros(len(tracks), np.uint32)
         bit[: len(source)] = np.left_shift(np.uint32(1), source.astype(np.uint32))
         has = np.concatenate([config.brings[source], central.has])
         return cls(tracks, mean, sound, has, source, stamp_ns, bit, particles)
+
+    @property
+    def key(self) -> NDArray[np.int64]:
+        """Which source track each is, by source and its own identifier, (P,)."""
+        return key_of(self.source, self.tracks.track_id[: len(self.source)])
 
     def split(self) -> tuple[Array, Array, Array, Array]:
         """Moments of the source tracks, then of the central ones."""
@@ -134,8 +142,8 @@ class Pool:
         dof = self.tracks.dof[at]
         mixture = None
         if self.tracks.components > 1:
-            bare = _bare(self.tracks)[at]
-            merge = bare & ~bare.all(1, keepdims=True) if take_particles else self.particles[at]
+            point = bare(self.tracks)[at]
+            merge = point & ~point.all(1, keepdims=True) if take_particles else self.particles[at]
             mixture = self._mixtures(at, merge)
         dof_or_none = None if np.isinf(dof).all() else dof
         return SourceTracks(self.mean[at], self.cov[at], dof_or_none, mixture, extras, self.tracks.layout.periods)
@@ -152,11 +160,6 @@ class Pool:
 
 def _is_young(config: CentreConfig, scan: TrackBatch, time_ns: int) -> bool:
     return len(scan) == 0 or time_ns - int(scan.time_ns.min()) <= config.params.max_scan_age_s * SECOND_NS
-
-
-def _bare(tracks: TrackBatch) -> Bools:
-    """Tell which tracks are particles, components without covariance, (N,)."""
-    return np.asarray(~tracks.cov.any((1, 2, 3)))
 
 
 def conditioned(cov: Array, fit: Bools) -> Array:

@@ -48,6 +48,9 @@ class StepInfo:
     unconverged : int           fusions whose weights did not converge
     unsound : int               fusions whose result was no density, so that a single member was taken instead
     beyond_half_circle : int    fusions of members that have no mean direction, made about the most certain one
+    held : int                  tracks of new scans held out of the fusion: too far from the central track they feed
+    released : int              tracks held out for too long, which are free to start or join another one
+    merged : (K, 2)             identifiers of central tracks and of those that ended in them, as duplicates
     """
 
     members: NDArray[np.intp]
@@ -57,6 +60,9 @@ class StepInfo:
     unconverged: int
     unsound: int
     beyond_half_circle: int
+    held: int
+    released: int
+    merged: NDArray[np.int64]
 
 
 def publish(params: FusionCentreParams, tracks: TrackBatch) -> TrackBatch:
@@ -65,7 +71,8 @@ def publish(params: FusionCentreParams, tracks: TrackBatch) -> TrackBatch:
 
 
 def told(
-    pool: Pool, association: Association, fused: Fused, before: CentralTracks, changes: Changes
+    pool: Pool, association: Association, fused: Fused, before: CentralTracks, changes: Changes,
+    merged: NDArray[np.int64],
 ) -> StepInfo:  # fmt: skip
     """Sum up a step."""
     member, sources = association.member, before.history.shape[1]
@@ -74,4 +81,7 @@ def told(
     foreign = int(np.count_nonzero(pool.tracks.source[member] & ~pool.bit[member]))
     taken = np.bincount(pool.source[member], minlength=sources)
     shared = foreign + len(association.remembered)
-    return StepInfo(taken, changes, fed, shared, fused.unconverged, fused.unsound, fused.beyond)
+    return StepInfo(
+        taken, changes, fed, shared, fused.unconverged, fused.unsound, fused.beyond, association.held,
+        association.released, merged,
+    )  # fmt: skip

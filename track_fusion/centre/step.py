@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
 
 from track_fusion.centre.associate import associate
 from track_fusion.centre.config import CentreConfig
+from track_fusion.centre.duplicates import merge
 from track_fusion.centre.fuse import fuse
 from track_fusion.centre.manage import manage
 from track_fusion.centre.pool import Pool, admitted
 from track_fusion.centre.publish import StepInfo, publish, told
+from track_fusion.centre.rhythm import Stamps, noted
 from track_fusion.centre.state import CentreState
 from track_fusion.tracks import TrackBatch
 
@@ -45,12 +48,21 @@ def step(
     fresh = np.zeros(sources, bool)
     fresh[list(scans)] = True
     pool = Pool.of(config, newest, before, fresh, time_ns)
-    association = associate(config, pool, fresh)
+    association = associate(config, pool, before.links, fresh)
     fused, random = fuse(config, pool, association, state.random)
     member = np.zeros((len(fused.tracks), sources), bool)
     member[association.target, pool.source[association.member]] = True
     supported_ns = np.full(len(fused.tracks), -1, np.int64)
     np.maximum.at(supported_ns, association.target, pool.stamp_ns[association.member])
-    central, changes = manage(config.manager, before, fused, member, fresh, supported_ns)
-    info = told(pool, association, fused, before, changes)
-    return CentreState(central, newest, random, time_ns), publish(config.params, central.tracks), info
+    stamps = _noted(state.stamps, time_ns, scans)
+    linked = dataclasses.replace(before, links=association.links)
+    central, changes = manage(config.manager, linked, fused, member, fresh, supported_ns, stamps)
+    central, merged = merge(config, central)
+    info = told(pool, association, fused, before, changes, merged)
+    return CentreState(central, newest, stamps, random, time_ns), publish(config.params, central.tracks), info
+
+
+def _noted(stamps: tuple[Stamps, ...], time_ns: int, scans: Mapping[int, TrackBatch]) -> tuple[Stamps, ...]:
+    """Note when new scans were made; one without tracks, whose stamp nobody told, at the time of the step."""
+    told_ns = {k: int(scan.time_ns[0]) if len(scan) else time_ns for k, scan in scans.items()}
+    return tuple(noted(own, told_ns[k]) if k in told_ns else own for k, own in enumerate(stamps))

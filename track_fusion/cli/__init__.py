@@ -6,7 +6,8 @@ import sys
 
 #: Which optional extra of this package brings a missing module.
 _EXTRAS = {
-    **dict.fromkeys(("click", "jsonschema", "rich"), "cli"), "rosbags": "bags", "matplotlib": "report", "rclpy": "ros",
+    **dict.fromkeys(("click", "jsonschema", "rich"), "cli"), "rosbags": "bags", "yaml": "bags",
+    "matplotlib": "report", "rclpy": "ros",
 }  # fmt: skip
 
 

@@ -13,7 +13,7 @@ import click
 from track_fusion.params import Fault, nearest
 
 #: Commands in the order of the help; command x is the function x of track_fusion/cli/x.py.
-COMMANDS = ("demo", "fuse", "rules", "scenarios", "reproduce", "compare", "record")
+COMMANDS = ("demo", "fuse", "rules", "scenarios", "reproduce", "compare", "record", "bag")
 #: Exit code for wrong input: a field, a parameter, an option.
 WRONG_INPUT = 2
 #: Exit code of a process that was interrupted, by the custom of shells.

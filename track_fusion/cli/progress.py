@@ -1,9 +1,9 @@
-"""Studies under a progress bar with the time left."""
+"""Progress bars with the time left: of studies, and of one long job."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,16 @@ from track_fusion.cli.output import console
 
 if TYPE_CHECKING:
     from track_fusion.study.study import Result, Study
+
+
+@contextlib.contextmanager
+def shown(what: str) -> Iterator[Callable[[float], None]]:
+    """Give a function that shows on a terminal which share of a job is done."""
+    err = console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        task = bar.add_task(what, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
 
 
 def results(studies: Sequence[Study], jobs: int, store: Path | None, *, told: bool = False) -> Iterator[Result]:

@@ -8,7 +8,7 @@ import click
 from rich.markup import escape
 from rich.table import Table
 
-from track_fusion.cli.output import console, grid, parameters, print_json, shown_default, table
+from track_fusion.cli import output
 from track_fusion.params import ParameterError
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def rules(ctx: click.Context, name: str | None, as_json: bool) -> None:
         except ParameterError as error:  # of another package; the rest are listed
             click.echo(str(error), err=True)
     if as_json:
-        print_json(described, indent=2)
+        output.print_json(described, indent=2)
     else:
         _print_tables(described)
 
@@ -59,12 +59,13 @@ def _check(name: str, as_json: bool) -> int:
     rule = find_rule(name)
     verdicts = list(check(rule))
     if as_json:
-        print_json({"rule": rule.key, "laws": [verdict._asdict() for verdict in verdicts]}, indent=2)
+        output.print_json({"rule": rule.key, "laws": [verdict._asdict() for verdict in verdicts]}, indent=2)
     else:
-        report = table("law", "outcome", "what it says, or why not", title=f"The laws of a fusion rule, for {rule.key}")
+        title = f"The laws of a fusion rule, for {rule.key}"
+        report = output.table("law", "outcome", "what it says, or why not", title=title)
         for verdict in verdicts:
             report.add_row(*map(escape, verdict))
-        console().print(report)
+        output.console().print(report)
     return int(any(verdict.outcome == "failed" for verdict in verdicts))
 
 
@@ -77,7 +78,7 @@ def describe(rule: Rule) -> dict[str, Any]:
         "guarantee": rule.promise,
         "source": rule.source,
         "cost": rule.cost,
-        "parameters": parameters(rule.params),
+        "parameters": output.parameters(rule.params),
     }
 
 
@@ -101,22 +102,22 @@ def facts(rule: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _print_tables(described: list[dict[str, Any]]) -> None:
-    out = console()
-    summary = table("rule", "family", "tracks", "guarantee", title=f"{len(described)} fusion rules")
+    out = output.console()
+    summary = output.table("rule", "family", "tracks", "guarantee", title=f"{len(described)} fusion rules")
     for rule in described:
         summary.add_row(*(escape(rule[name]) for name in ("key", "family", "arity", "guarantee")))
     out.print(summary)
     for rule in described:
         out.print(f"\n[bold]{rule['key']}[/bold]  {escape(rule['title'])}")
-        out.print(grid(facts(rule)))
+        out.print(output.grid(facts(rule)))
         if rule["parameters"]:
             out.print(_parameter_table(rule["parameters"]))
 
 
 def _parameter_table(parameters: list[dict[str, Any]]) -> Table:
-    shown = table("parameter", "default", "value", "meaning")
+    shown = output.table("parameter", "default", "value", "meaning")
     for p in parameters:
         unit = f" [{p['unit']}]" if p["unit"] else ""
-        cells = (p["name"], shown_default(p["default"]), p["wanted"] + unit, p["doc"])
+        cells = (p["name"], output.shown_default(p["default"]), p["wanted"] + unit, p["doc"])
         shown.add_row(*(escape(cell) for cell in cells))
     return shown

@@ -10,7 +10,7 @@ import numpy as np
 
 from track_fusion.angles import HALF_TURN, TURN, named_period, periods_of, wrap
 from track_fusion.cli.tracks_schema import InputError, check, shared_schema, tracks_schema
-from track_fusion.densities.mixture.mixture import moments, padded
+from track_fusion.densities.mixture.mixture import moments, stacked
 from track_fusion.linalg import ASYMMETRY_TOLERANCE, Array, asymmetric, is_positive_definite, outer, symmetrise
 from track_fusion.rules import FusedTracks, Mixture, SourceTracks
 from track_fusion.tracks import WEIGHT_TOLERANCE
@@ -49,7 +49,7 @@ def read_tracks(text: bytes, needs: Collection[str], rule: str, optional: Collec
     mean, cov = (np.stack(arrays) for arrays in zip(*merged, strict=True))
     dof = np.array([np.inf if track.get("dof") is None else track["dof"] for track in tracks], float)
     known_dof = dof if np.isfinite(dof).any() else None
-    parts = _stacked(mixtures) if any("components" in track for track in tracks) else None
+    parts = stacked(*mixtures) if any("components" in track for track in tracks) else None
     return SourceTracks(mean, cov, known_dof, parts, _extras(data, cov, periods), periods)
 
 
@@ -174,11 +174,6 @@ def _symmetric(given: Any, place: str) -> Array:
 def _check_definite(cov: Array, place: str) -> None:
     if not is_positive_definite(cov):
         _fail(place, f"must be positive definite; smallest eigenvalue {np.linalg.eigvalsh(cov)[0]:.3g}")
-
-
-def _stacked(mixtures: list[Mixture]) -> Mixture:
-    alike = [padded(mixture, max(m.count for m in mixtures)) for mixture in mixtures]
-    return Mixture(*(np.stack([getattr(m, name) for m in alike]) for name in ("weight", "mean", "cov")))
 
 
 # What some rules need beyond the tracks.

@@ -93,12 +93,7 @@ class GaussianSumModes:
     one: GaussianModeFilter = Extended()
 
     def predict(self, modes: MixtureModes, transitions: Sequence[Transition]) -> MixtureModes:
-        """Predict one interval, then reduce each mode to at most `count` components.
-
-        Parameters
-        ----------
-        modes : MixtureModes           (..., M)
-        transitions : M Transitions    one a mode
+        """Predict one interval, each of the M modes by its transition, then reduce each to at most `count` components.
 
         Raises
         ------
@@ -118,17 +113,9 @@ class GaussianSumModes:
         return MixtureModes(modes.probability, self.reduce(modes.mixture, self.count))
 
     def update(self, modes: MixtureModes, z: Array, sensor: Sensor) -> tuple[MixtureModes, Evidence]:
-        """Condition every component on z = h(x) + v; components and modes are weighed by their likelihoods.
+        """Condition every component on z = h(x) + v, (..., m), and weigh components and modes by their likelihoods.
 
-        Parameters
-        ----------
-        modes : MixtureModes    (..., M)
-        z : (..., m)
-        sensor : Sensor
-
-        Returns
-        -------
-        MixtureModes, Evidence of z over all modes
+        The evidence is that over all modes.
         """
         part = modes.mixture
         moved, learned = self.one.update(Gaussian(part.mean, part.cov), z[..., None, None, :], sensor)

@@ -113,12 +113,7 @@ class InteractingMultipleModel:
     one: GaussianModeFilter = Extended()
 
     def predict(self, modes: Modes, transitions: Sequence[Transition]) -> Modes:
-        """Predict one interval.
-
-        Parameters
-        ----------
-        modes : Modes                  (..., M)
-        transitions : M Transitions    one a mode
+        """Predict one interval, each of the M modes by its transition.
 
         Raises
         ------
@@ -133,18 +128,7 @@ class InteractingMultipleModel:
         return modes if self.jump_first else mix(modes, self.chain)
 
     def update(self, modes: Modes, z: Array, sensor: Sensor) -> tuple[Modes, Evidence]:
-        """Condition every mode on z = h(x) + v, and weigh it by its likelihood.
-
-        Parameters
-        ----------
-        modes : Modes      (..., M)
-        z : (..., m)
-        sensor : Sensor
-
-        Returns
-        -------
-        Modes, Evidence of z over all modes
-        """
+        """Condition every mode on z = h(x) + v, (..., m), and weigh it by its likelihood; evidence over all modes."""
         part, learned = self.one.update(Gaussian(modes.mean, modes.cov), z[..., None, :], sensor)
         probability, total = reweighted(modes.probability, learned.log_likelihood)
         return Modes(probability, part.mean, part.cov), Evidence(total)

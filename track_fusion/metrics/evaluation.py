@@ -7,7 +7,10 @@ import dataclasses
 from typing import Any, NamedTuple
 
 from track_fusion.metrics.consistency import Consistency, consistency_of_sum
+from track_fusion.metrics.gospa import SetDistanceParams
+from track_fusion.metrics.latency import Latencies
 from track_fusion.metrics.pairing import Pairs, paired
+from track_fusion.metrics.scores import Scores
 from track_fusion.metrics.tally import Errors, Tally, TargetTallies
 from track_fusion.metrics.truth import Known, Truth
 from track_fusion.params import Params, param
@@ -57,8 +60,9 @@ class Judgement(NamedTuple):
 class Totals:
     """Sums over judged scans."""
 
-    def __init__(self, layout: StateLayout) -> None:
+    def __init__(self, layout: StateLayout, scored: SetDistanceParams) -> None:
         self._layout, self.all, self.targets = layout, Tally(layout), TargetTallies(layout)
+        self.scores = Scores(scored)
         self.times = self.missed = self.false = self.unjudged = self.unjudged_times = 0
 
     def add(self, judged: Judgement) -> None:
@@ -74,6 +78,9 @@ class Totals:
         self.unjudged += truth.unknown
         # A track without a target may be that of one whose truth is unknown.
         self.false += max(len(tracks) - matched - truth.unknown, 0)
+        if not truth.unknown:  # else nobody knows which tracks are false
+            at = list(self._layout.position)
+            self.scores.add(truth.targets, truth.states[:, at], tracks.track_id, tracks.moments[0][:, at])
         errors = Errors.of(self._layout, pairs.error, pairs.nees)
         self.all.add(errors)
         for k, (i, j) in enumerate(zip(pairs.target, pairs.track, strict=True)):
@@ -98,15 +105,20 @@ class Evaluation:
     layout : StateLayout
     params : EvaluationParams
     whole_truth : bool    each step of the truth is one table; False: it comes target by target, and may have gaps
+    scored : SetDistanceParams    of GOSPA and the other scores; None: the defaults
     """
 
-    def __init__(self, layout: StateLayout, params: EvaluationParams, whole_truth: bool = True) -> None:
+    def __init__(
+        self, layout: StateLayout, params: EvaluationParams, whole_truth: bool = True,
+        scored: SetDistanceParams | None = None,
+    ) -> None:  # fmt: skip
         self._layout, self._params = layout, params
+        self._latencies = Latencies()
         self._max_gap_ns = round(params.max_gap_s * SECOND_NS)
         self._truth = Truth(layout, self._max_gap_ns, whole_truth)
         self._scans: dict[int, TrackBatch] = {}  # not yet in the sums
         self._judged: dict[int, Judgement] = {}  # of these, as far as they can be judged so far
-        self._closed = Totals(layout)
+        self._closed = Totals(layout, scored or SetDistanceParams())
         self._closed_ns: int | None = None  # stamp of the last scan in the sums
         self._answered: set[int] = set()  # steps of the truth held that a scan was judged at
         self._unanswered = 0  # steps of the truth dropped that none was
@@ -144,8 +156,10 @@ class Evaluation:
                 self._judge(scan_ns)
         self._settle()
 
-    def add_tracks(self, stamp_ns: int, tracks: TrackBatch) -> None:
-        """Take the tracks of a time, also when there are none."""
+    def add_tracks(self, stamp_ns: int, tracks: TrackBatch, arrival_ns: int | None = None) -> None:
+        """Take the tracks of a time, also when there are none; `arrival_ns`, if known, tells how late they came."""
+        if arrival_ns is not None:
+            self._latencies.add((arrival_ns - stamp_ns) / SECOND_NS)
         tracks = tracks[tracks.is_confirmed] if self._params.confirmed_only else tracks
         if self._closed_ns is not None and stamp_ns <= self._closed_ns:
             self._closed.add(Judgement(None, tracks, None))
@@ -209,6 +223,8 @@ class Evaluation:
     def result(self) -> dict[str, Any]:
         """Everything as JSON-ready values: figures over all and for each target, what was unmatched or not judged.
 
+        Of the scores, times at which some truth is unknown are left out.
+
         The verdict over all is "incomplete" instead of "consistent" when too many samples could not be judged.
         """
         totals = copy.deepcopy(self._closed)
@@ -226,6 +242,8 @@ class Evaluation:
             "false": totals.false,
             "unjudged": totals.unjudged,
             "all": figures,
+            "scores": totals.scores.figures(),
+            "latency": self._latencies.figures(),
             "targets": totals.targets.figures(),
         }
 

@@ -13,11 +13,12 @@ from sensor_msgs.msg import PointCloud2
 from msg_adapters.header import stamp_to_ns
 from msg_adapters.track_table import track_table_from_msg
 from msg_adapters.types import MESSAGE_TYPES
+from track_fusion.messages.screening import FrameParams, screened_tracks
 from track_fusion.metrics.evaluation import Evaluation, EvaluationParams
+from track_fusion.metrics.gospa import SetDistanceParams
 from track_fusion.nodes.managed import ManagedNode, class_of
 from track_fusion.nodes.process import end, run
 from track_fusion.nodes.ros_params import declare
-from track_fusion.nodes.screening import FrameParams, screened_tracks
 from track_fusion.params import Params, param
 
 #: How often the end of the run is looked for, wall time.
@@ -53,13 +54,14 @@ class EvaluatorNode(ManagedNode):
         self._truth: Any = None
         self.layout, self.kind = self.frame.layout, MESSAGE_TYPES[self.params.truth_type]
         self._evaluation_params = declare(self, EvaluationParams)
+        self._scored = declare(self, SetDistanceParams, "gospa_")
         self.finished = self._had_truth = False
         self._foreign = ""
         self.on_clock_jump()
 
     def on_clock_jump(self) -> None:
         """Begin to judge anew: the same stamps will come again."""
-        self.evaluation = Evaluation(self.layout, self._evaluation_params, self.kind.whole_scan)
+        self.evaluation = Evaluation(self.layout, self._evaluation_params, self.kind.whole_scan, self._scored)
         self._warned, self._look_at, self._heard_s = False, 1, time.monotonic()
 
     def connect(self) -> None:
@@ -76,8 +78,9 @@ class EvaluatorNode(ManagedNode):
         self._check()
 
     def _on_tracks(self, msg: Any) -> None:
-        stamp_ns = stamp_to_ns(msg.header.stamp)
-        self.evaluation.add_tracks(stamp_ns, screened_tracks(self, track_table_from_msg(msg), self.layout))
+        arrival_ns, stamp_ns = self.now_ns(), stamp_to_ns(msg.header.stamp)
+        tracks = screened_tracks(self, track_table_from_msg(msg), self.layout)
+        self.evaluation.add_tracks(stamp_ns, tracks, arrival_ns)
         self._check()
 
     def _check(self) -> None:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 import time
 import traceback
-from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import rclpy.utilities
@@ -16,15 +15,17 @@ from rclpy.clock import Clock, JumpThreshold
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from msg_adapters.arrays import MessageError
+from msg_adapters.classes import message_class
 from msg_adapters.diagnostics import diagnostic_array
-from msg_adapters.types import message_class
 from track_fusion.clock import ClockParams
-from track_fusion.nodes.ros_params import declare, refuse_unknown, unfit_files
-from track_fusion.params import Fault, ParameterError, Params, param
+from track_fusion.messages.counts import Counts
+from track_fusion.messages.parameters import ManagedParams
+from track_fusion.nodes.ros_params import declare, refuse_unknown_of, unfit_files
+from track_fusion.params import Fault, ParameterError
 
 DIAGNOSTICS_PERIOD_S = 1.0
 #: How often a held-back message looks whether the clock and the subscribers are there.
@@ -33,24 +34,12 @@ LOOK_PERIOD_S = 0.02
 MAX_HELD = 10_000
 
 
-@dataclasses.dataclass(frozen=True)
-class ManagedParams(Params):
-    """Life of a node."""
-
-    autostart: bool = param(True, "configure and activate at start; false: wait for lifecycle transitions")
-    expected_subscribers: int = param(
-        0,
-        "hold input back until ~/tracks has so many subscribers, so that none misses the first message; 0: do not wait",
-        low=0,
+def qos(depth: int, *, latched: bool = False) -> QoSProfile:
+    """Reliable, keep the last `depth`: the default of every topic of this package; latched: also for late readers."""
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+    return QoSProfile(
+        reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=depth, durability=durability
     )
-    subscribers_deadline_s: float = param(
-        20.0, "after this wall time work begins without the missing subscribers, with a warning", unit="s", low=0.0
-    )
-
-
-def qos(depth: int) -> QoSProfile:
-    """Reliable, keep the last `depth`: the default of every topic of this package."""
-    return QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=depth)
 
 
 def class_of(kind: str) -> type:
@@ -78,8 +67,8 @@ class ManagedNode(LifecycleNode):
     def __init__(self, name: str, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
         self.log: Any = LifecycleNode.get_logger(self)
-        self.rejected: Counter[str] = Counter()
-        self.counted: Counter[str] = Counter()
+        self.counts = Counts(lambda text: self.log.warning(text))
+        self.counted, self.rejected = self.counts.counted, self.counts.rejected
         self.active = False
         self.released = False
         self._error: Exception | None = None
@@ -89,7 +78,7 @@ class ManagedNode(LifecycleNode):
         self._wall = Clock(clock_type=ClockType.STEADY_TIME)
         self.managed, self.clock = declare(self, ManagedParams), declare(self, ClockParams)
         self.declare_parameters_()
-        refuse_unknown(self)
+        refuse_unknown_of(self)
         self._warn_of_unfit_files(kwargs)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos(10))
         self.every(DIAGNOSTICS_PERIOD_S, self._publish_diagnostics)
@@ -218,6 +207,15 @@ class ManagedNode(LifecycleNode):
             qos_overriding_options=QoSOverridingOptions.with_default_policies(), **kwargs,
         )  # fmt: skip
 
+    def drained(self, subscription: Any, limit: int) -> Iterator[Any]:
+        """Take the messages that wait in a subscription, at most so many; none while older ones are held back."""
+        for _ in range(0 if self._held else limit):
+            with subscription.handle:
+                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            if taken is None:
+                return
+            yield taken[0]
+
     def _handle(self, handle: Callable[[Any], None], msg: Any) -> None:
         try:
             handle(msg)
@@ -275,14 +273,9 @@ class ManagedNode(LifecycleNode):
 
     # Rejections and diagnostics.
 
-    def reject(self, reasons: dict[str, int] | Counter[str], text: str = "") -> None:
+    def reject(self, reasons: Mapping[str, int], text: str = "") -> None:
         """Count rejected messages or tracks by reason, and log the first of each kind."""
-        for reason, count in reasons.items():
-            if not count:
-                continue
-            if not self.rejected[reason]:
-                self.log.warning(f"Rejected ({reason}): {text or 'see /diagnostics for the count'}")
-            self.rejected[reason] += count
+        self.counts.reject(reasons, text or "see /diagnostics for the count")
 
     def now_ns(self) -> int:
         """ROS time; 0 until simulated time has begun."""

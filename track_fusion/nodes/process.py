@@ -56,8 +56,11 @@ def run(make: Callable[[], ManagedNode]) -> int:
 def _ending() -> bool:
     """Tell whether a signal is ending this process: its errors may be seen a little before the context says so."""
     deadline = time.monotonic() + SIGNAL_LAG_S
-    while rclpy.utilities.ok() and time.monotonic() < deadline:
-        time.sleep(0.01)
+    try:
+        while rclpy.utilities.ok() and time.monotonic() < deadline:
+            time.sleep(0.01)
+    except KeyboardInterrupt:  # Python's own handler may run after that of rclpy
+        return True
     return not rclpy.utilities.ok()
 
 

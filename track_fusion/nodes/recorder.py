@@ -14,6 +14,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from track_fusion.bags.write import add_topic, create_bag
 from track_fusion.nodes.managed import class_of, qos
 from track_fusion.params import Fault
 
@@ -41,26 +42,12 @@ class Recorder:
     """
 
     def __init__(self, node: Node, path: Path, topics: Mapping[str, str], storage: str = "mcap") -> None:
-        try:
-            from rosbags.rosbag2 import StoragePlugin, Writer
-            from rosbags.typesys import Stores, get_typestore
-        except ImportError:
-            raise Fault(
-                "Recording needs the Python package rosbags: pip install rosbags. On a robot, use ros2 bag record."
-            ) from None
-        plugins = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
-        if storage not in plugins:
-            raise Fault(f"The storage must be one of {', '.join(plugins)}. Got {storage!r}.")
-        if path.exists():
-            raise Fault(f"{path} exists already; a bag is not overwritten.")
         self._node, self.counts = node, Counter[str]()
         self._early: deque[tuple[Any, bytes]] = deque()
         classes = {kind: class_of(kind) for kind in topics.values()}
-        self._writer = Writer(path, version=9, storage_plugin=plugins[storage])
-        self._writer.open()
-        store = get_typestore(Stores.ROS2_JAZZY)
+        self._writer = create_bag(path, storage)
         for topic, kind in topics.items():
-            connection = self._writer.add_connection(topic, kind, typestore=store)
+            connection = add_topic(self._writer, topic, kind)
             node.create_subscription(classes[kind], topic, self._write(connection), qos(QUEUE), raw=True)
 
     def _write(self, connection: Any) -> Callable[[Any], None]:

@@ -17,7 +17,7 @@ from track_fusion.nodes.managed import ManagedNode, qos
 from track_fusion.nodes.process import end, run
 from track_fusion.nodes.ros_params import declare
 from track_fusion.nodes.scenario_player import ScenarioParams, ScenarioPlayer
-from track_fusion.params import Fault, ParameterError, Params, param
+from track_fusion.params import Fault, Params, param
 
 #: How often the state of the network and the deadline are looked at, wall time.
 LOOK_PERIOD_S = 0.02
@@ -34,10 +34,11 @@ class ReplayParams(Params):
 
     bag: str = param("", "a rosbag2 directory to play instead of a scenario")
     pace: str = param(
-        "lockstep",
-        "lockstep: publish a step when the result of the one before has come back on ~/fused; "
+        "auto",
+        "auto: lockstep for a scenario, realtime for a bag; lockstep: publish a step when the result of the one before "
+        "has come back on ~/fused, a message of a bag when the one before is counted on ~/processed; "
         "realtime: by the wall clock, times 'rate'",
-        choices=("lockstep", "realtime"),
+        choices=("auto", "lockstep", "realtime"),
     )
     rate: float = param(
         1.0, "seconds of scenario or bag time a second of wall time, at pace realtime", low=0.0, strict=True
@@ -61,18 +62,17 @@ class ReplayNode(ManagedNode):
         self.bag = declare(self, BagParams, "bag_")
         self.finished = self._started = False
         self._complete_s = math.inf
-        if self.params.bag and self.params.pace == "lockstep" and "pace" in self._parameter_overrides:
-            raise ParameterError("The 'pace' parameter must be realtime with a bag. Got 'lockstep'.")
 
     def connect(self) -> None:
         """Create the topics."""
         self._clock_out = self.create_publisher(ClockMessage, "/clock", qos(10))
         params, each = self.params, self.params.expected_subscribers_each
         self._player: BagPlayer | ScenarioPlayer
+        pace = ("realtime" if params.bag else "lockstep") if params.pace == "auto" else params.pace
+        rate = params.rate if pace == "realtime" else None
         if params.bag:
-            self._player = BagPlayer(self, self._tell_time, params.bag, self.bag, params.rate, each)
+            self._player = BagPlayer(self, self._tell_time, params.bag, self.bag, rate, each)
         else:
-            rate = params.rate if params.pace == "realtime" else None
             self._player = ScenarioPlayer(self, self._tell_time, self.scenario, rate, each)
         self.every(LOOK_PERIOD_S, self._tick)
 

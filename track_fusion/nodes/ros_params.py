@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -11,16 +11,13 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.exceptions import InvalidParameterValueException
 from rclpy.node import Node
 
+from track_fusion.messages.parameters import fits, refuse_unknown, sections_of, with_prefix
 from track_fusion.models.choices import Choice, make
-from track_fusion.params import ParameterError, Params, Spec, from_dict, specs, unknown_name_error
-from track_fusion.random_streams import RandomParams
+from track_fusion.params import Params, Spec, specs
 
 P = TypeVar("P", bound=Params)
 T = TypeVar("T")
 
-#: Parameters that rclpy declares by itself.
-_BUILT_IN = ("use_sim_time", "start_type_description_service")
-_BUILT_IN_PREFIX = "qos_overrides."
 #: ROS ranges need both ends.
 _WIDEST = {float: 1.7e308, int: 2**63 - 1}
 
@@ -45,12 +42,7 @@ def declare(node: Node, cls: type[P], prefix: str = "") -> P:
         except InvalidParameterValueException:  # the range of the descriptor; the dataclass says more
             given = node._parameter_overrides[full].value
         values[name] = default if given is None else given
-    if issubclass(cls, RandomParams):
-        values["role"] = values["role"] or node.get_name()
-    try:
-        return from_dict(cls, values)
-    except ParameterError as error:
-        raise ParameterError(str(error).replace("The '", f"The '{prefix}", 1)) from None
+    return with_prefix(cls, values, prefix, node.get_name())
 
 
 def chosen(node: Node, table: Mapping[str, Choice[T]], key: str, *before: Any) -> T:
@@ -82,19 +74,6 @@ def _descriptor(name: str, spec: Spec) -> ParameterDescriptor:
     return descriptor
 
 
-def refuse_of_others(node: Node, table: Collection[str], choice: str, key: str) -> None:
-    """Check that no parameter of another entry of a table is given; those of an entry are named `<key>.<name>`.
-
-    Raises
-    ------
-    ParameterError    one belongs to an entry that was not chosen
-    """
-    for name in node._parameter_overrides:
-        owner, dot, _ = name.partition(".")
-        if dot and owner != key and owner in table:
-            raise ParameterError(f"The '{name}' parameter belongs to '{owner}', but {choice} is '{key}'.")
-
-
 def unfit_files(arguments: Sequence[str], node: str) -> dict[str, list[str]]:
     """Return the parameter files of a command line that hold nothing for a node, with the names they do hold.
 
@@ -103,46 +82,16 @@ def unfit_files(arguments: Sequence[str], node: str) -> dict[str, list[str]]:
     arguments : such as sys.argv
     node : full name, after remapping
     """
-    import yaml  # type: ignore[import-untyped]  # comes with rclpy
-
     unfit, inside = {}, False
     for word, following in zip(arguments, [*arguments[1:], ""], strict=True):
         inside = word == "--ros-args" or (inside and word != "--")
         if inside and word == "--params-file":
-            names = _sections(yaml.safe_load(Path(following).read_text()))
-            if not any(_fits(name.split("/"), node.strip("/").split("/")) for name in names):
+            names = list(sections_of(Path(following)))
+            if not any(fits(name, node) for name in names):
                 unfit[following] = names
     return unfit
 
 
-def _sections(content: Any, above: str = "") -> list[str]:
-    """List the names of the sections of a parameter file; namespaces may be nested."""
-    if not isinstance(content, Mapping):
-        return []
-    names = [above] if "ros__parameters" in content else []
-    inner = {name: below for name, below in content.items() if name != "ros__parameters"}
-    for name, below in inner.items():
-        names += _sections(below, f"{above}/{str(name).strip('/')}".strip("/"))
-    return names
-
-
-def _fits(pattern: Sequence[str], name: Sequence[str]) -> bool:
-    """Match the words of a name: * is any one, ** any number of them."""
-    if not pattern or not name:
-        return not name and all(word == "**" for word in pattern)
-    if pattern[0] == "**":
-        return _fits(pattern[1:], name) or _fits(pattern, name[1:])
-    return pattern[0] in ("*", name[0]) and _fits(pattern[1:], name[1:])
-
-
-def refuse_unknown(node: Node) -> None:
-    """Check, once all is declared, that every parameter given on start-up exists.
-
-    Raises
-    ------
-    ParameterError    a name is unknown; the nearest valid one is given
-    """
-    valid = [n for n in node._parameters if not n.startswith(_BUILT_IN_PREFIX)]
-    for name in node._parameter_overrides:
-        if name not in valid and name not in _BUILT_IN and not name.startswith(_BUILT_IN_PREFIX):
-            raise unknown_name_error(name, valid)
+def refuse_unknown_of(node: Node) -> None:
+    """Check, once all is declared, that every parameter given on start-up exists; raise as `refuse_unknown`."""
+    refuse_unknown(node._parameter_overrides, node._parameters)

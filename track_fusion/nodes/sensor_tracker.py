@@ -14,12 +14,12 @@ from msg_adapters.detection_table import detection_table_from_msg
 from msg_adapters.header import check_header
 from msg_adapters.odometry import odometry_to_msgs
 from msg_adapters.track_table import track_table_from_msg, track_table_to_msg
+from track_fusion.messages.screening import FrameParams, screened_detections, screened_tracks
 from track_fusion.models.choices import MOTIONS, SENSORS
 from track_fusion.models.measurement import RangeBearingSensor
 from track_fusion.nodes.managed import ManagedNode
 from track_fusion.nodes.process import end, run
 from track_fusion.nodes.ros_params import chosen, declare
-from track_fusion.nodes.screening import FrameParams, screened_detections, screened_tracks
 from track_fusion.params import ParameterError, Params, param
 from track_fusion.trackers.filters import FILTERS
 from track_fusion.trackers.many_targets import PdaTracker, PdaTrackerParams
@@ -167,9 +167,14 @@ class SensorTrackerNode(ManagedNode):
                 self._odometry.publish(msg)
 
     def diagnose(self) -> tuple[list[str], dict[str, Any]]:
-        """Warn when feedback was missing."""
-        missing = self.counted["feedback_timeouts"]
-        return ([f"{missing} scans without feedback"] if missing else []), {"waiting_scans": len(self._queue)}
+        """Warn when feedback was missing, or tentative tracks were dropped."""
+        missing, values = self.counted["feedback_timeouts"], {"waiting_scans": len(self._queue)}
+        warnings = [f"{missing} scans without feedback"] if missing else []
+        if isinstance(self.tracker, PdaTracker):
+            values["dropped_tentative"] = dropped = self.tracker.tracks.dropped
+            if dropped:
+                warnings.append(f"{dropped} tentative tracks were dropped: more than max_tentative_tracks at a time")
+        return warnings, values
 
 
 def main() -> None:

@@ -33,6 +33,9 @@ from track_fusion.tracks import CONFIRMED, SECOND_NS, TrackBatch
 ROUNDING = 1e-9
 #: A detection counts as claimed when it is a track's with at least this probability.
 CLAIMED = 0.1
+#: A detection that could begin more tracks than this lies in a crowd, and begins the likeliest alone. Clutter of
+#: thousands, spread as clutter is, stays below.
+CROWD = 64
 
 Indices = NDArray[np.intp]
 
@@ -49,6 +52,9 @@ class PdaTrackerParams(ClutterParams):
     merge_probability: float = param(
         0.5, "two tracks are one when their distance lies within this quantile of chi-square", low=0.0, high=1.0
     )
+    max_tentative_tracks: int = param(
+        20_000, "keep at most so many tracks that do not count yet; the oldest are dropped and counted", low=1
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,12 +67,14 @@ class PdaTracks(Candidate):
     track_id : (N,)              ascending
     leftover : (D, m)            detections of the last scan that no track claimed
     next_id : int
+    dropped : int                how many were dropped so far, being too many tentative ones
     """
 
     confirmed: NDArray[np.bool_]
     track_id: NDArray[np.int64]
     leftover: Array
     next_id: int
+    dropped: int = 0
 
     @classmethod
     def none(cls, axes: int, measured: int) -> PdaTracks:
@@ -130,7 +138,7 @@ class PdaTracker:
         values = wrap(values, self.sensor.periods)
         tracks, claimed = self._updated(self._filter.predict(self.tracks, self.motion.over(dt_s)), values)
         free = values[~claimed]
-        self.tracks = dataclasses.replace(self._begun(tracks, free, dt_s), leftover=free)
+        self.tracks = dataclasses.replace(self._capped(self._begun(tracks, free, dt_s)), leftover=free)
         return self._batch(self.tracks[self.tracks.confirmed])
 
     def _updated(self, tracks: PdaTracks, values: Array) -> tuple[PdaTracks, NDArray[np.bool_]]:
@@ -187,7 +195,8 @@ class PdaTracker:
         start = Extended().predict(Gaussian(mean, cov), self.motion.over(dt_s))
         row, col = self._near(start.mean, start.cov, free)
         begun, learned = Extended().update(Gaussian(start.mean[row], start.cov[row]), free[col], self.sensor)
-        gated = learned.nis <= self._gamma
+        gated = np.flatnonzero(learned.nis <= self._gamma)
+        gated = gated[_thinned(col[gated], learned.nis[gated])]
         mean, cov = begun.mean[gated], begun.cov[gated]
         count = len(mean)
         return PdaTracks(
@@ -198,7 +207,17 @@ class PdaTracker:
             np.concatenate([tracks.track_id, tracks.next_id + np.arange(count)]),
             tracks.leftover,
             tracks.next_id + count,
+            tracks.dropped,
         )
+
+    def _capped(self, tracks: PdaTracks) -> PdaTracks:
+        """Drop the oldest tentative tracks that are too many."""
+        tentative = ~tracks.confirmed
+        surplus = int(np.count_nonzero(tentative)) - self.params.max_tentative_tracks
+        if surplus <= 0:
+            return tracks
+        kept = tracks[~tentative | (np.cumsum(tentative) > surplus)]
+        return dataclasses.replace(kept, dropped=tracks.dropped + surplus)
 
     def _batch(self, tracks: PdaTracks) -> TrackBatch:
         if not len(tracks.mean):
@@ -207,6 +226,17 @@ class PdaTracker:
             self.layout, self.frame_id, wrap(tracks.mean, self.layout.periods), tracks.cov,
             time_ns=self.time_ns, track_id=tracks.track_id, existence=tracks.existence, status=CONFIRMED,
         )  # fmt: skip
+
+
+def _thinned(col: Indices, nis: Array) -> NDArray[np.bool_]:
+    """Tell which of the tracks begun, (B,), are kept: of a detection in a crowd the likeliest alone."""
+    crowded = np.bincount(col)[col] > CROWD
+    if not crowded.any():
+        return ~crowded
+    order = np.lexsort((nis, col))
+    kept = ~crowded
+    kept[order[np.unique(col[order], return_index=True)[1]]] = True
+    return kept
 
 
 def _padded(row: Indices, col: Indices, rows: int) -> tuple[Indices, NDArray[np.bool_]]:

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from densities.mixture.examples import COMMON, FIRST, SECOND, draw, mixand_moments
 from scipy import integrate
+from scipy.stats import norm
 
 from track_fusion.densities.mixture.exponent import optimise_omega
 from track_fusion.densities.mixture.mixture import Mixture, log_pdf, moments, sample
 from track_fusion.densities.mixture.proposals import (
     Proposal,
+    bounded,
     direct_local_sampling,
     heavy_tail,
     indirect_global_sampling,
@@ -109,10 +111,11 @@ def _proposals(kind: str) -> tuple[Proposal, object]:
     found = laplace(quotient)
     if kind == "lagis":
         return laplace_proposals(found), quotient
-    return heavy_tail(found, exact_bound(quotient, COMMON).cov), quotient
+    bound = exact_bound(quotient, COMMON)
+    return bounded(found, bound.mean, bound.cov) if kind == "bounded" else heavy_tail(found, bound.cov), quotient
 
 
-@pytest.mark.parametrize("kind", ["ingis", "lagis", "heavy_tail"])
+@pytest.mark.parametrize("kind", ["ingis", "lagis", "heavy_tail", "bounded"])
 def test_dls_against_quadrature(kind: str) -> None:
     proposal, quotient = _proposals(kind)
     found = direct_local_sampling(quotient, proposal, np.random.default_rng(0), 20000)  # type: ignore[arg-type]
@@ -163,6 +166,29 @@ def test_heavy_tails_reach_between_two_and_eight() -> None:
         np.testing.assert_allclose(scale[:, 0], 1.0)
         np.testing.assert_allclose(scale[:, -1], top)
         np.testing.assert_allclose(scale[:, 1:] / scale[:, :-1], top**0.25)
+
+
+def test_no_weight_of_a_bounded_proposal_exceeds_twice_the_bound() -> None:
+    """By quadrature it is a density, and everywhere at least half of the Gaussian above the mixand."""
+    quotient = exact_quotient(FIRST, SECOND, COMMON)
+    bound = exact_bound(quotient, COMMON)
+    proposal = bounded(laplace(quotient), bound.mean, bound.cov)
+    points = np.broadcast_to(POINTS, (4, *POINTS.shape))
+    log_drawn = proposal.log_pdf(points)
+    np.testing.assert_allclose(np.exp(log_drawn).sum(-1) * 80.0 / 4000, 1.0, rtol=1e-6)
+    for z in range(4):
+        mixand = norm.logpdf(POINTS[:, 0], quotient.numerator.mean[z, 0], np.sqrt(quotient.numerator.cov[z, 0, 0]))
+        log_weight = quotient.numerator.log_weight[z] + mixand - _log(COMMON) - log_drawn[z]
+        assert log_weight.max() <= np.log(2.0) + bound.log_weight[z] + 1e-9
+
+
+def test_every_other_sample_of_a_bounded_proposal_is_of_the_gaussian_above() -> None:
+    quotient = exact_quotient(FIRST, SECOND, COMMON)
+    found, bound = laplace(quotient), exact_bound(quotient, COMMON)
+    points = bounded(found, bound.mean, bound.cov).drawn(np.random.default_rng(0).normal(size=(4, 40000, 1)))
+    above = points[:, ::2, 0]
+    np.testing.assert_allclose(above.mean(-1), bound.mean[:, 0], atol=0.03 * np.sqrt(bound.cov.max()))
+    np.testing.assert_allclose(above.var(-1), bound.cov[:, 0, 0], rtol=0.04)
 
 
 def test_pruning_drops_only_what_is_negligible() -> None:

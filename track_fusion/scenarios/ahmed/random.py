@@ -223,29 +223,21 @@ def _claims() -> Iterator[Claim]:
         yield Claim.order(f"{kind} fusion by IGS improves with the samples", figure, *_names(key, *reversed(igs)))
         yield Claim.each(
             f"{kind} fusion: DLS is more accurate than IGS in nearly all cases (judged: in the median at each of the "
-            "four numbers of samples)",
-            figure,
-            _names(key, *dls),
-            _names(key, *igs),
-            ascending,
-        )
+            "four numbers of samples)", figure, _names(key, *dls), _names(key, *igs), ascending,
+        )  # fmt: skip
         yield Claim(
             f"{kind} fusion: DLS and IGS improve on {rough.upper()} (judged: with each of their numbers of samples)",
-            f"Section 6, {figure}",
-            _names(key, *dls, *igs, rough),
+            f"Section 6, {figure}", _names(key, *dls, *igs, rough),
             lambda *all_: [all_[-1] - divergence for divergence in all_[:-1]],
-        )
+        )  # fmt: skip
     for key in ("mixture_exact", "mixture_wep"):
         printed = {name: value for name, value in FIGURES_4_5.items() if name.startswith(f"given-{key}@")}
         order = [name.partition("@")[2] for name in sorted(printed, key=lambda name: printed[name])]
         listed = ", ".join(name.removeprefix("example_") for name in order)
         source = "Fig. 4" if key == "mixture_exact" else "Fig. 5"
         yield Claim.order(f"in the example, from the best: {listed}", source, *_names(key, *order))
-    yield Claim.order(
-        "IGS with 1000 samples is more accurate than expectation maximisation of 5000",
-        "Section 5.1, Fig. 5",
-        *_names("mixture_wep", "example_igs_1000", "example_em_5000"),
-    )
+    yield Claim.order("IGS with 1000 samples is more accurate than expectation maximisation of 5000",
+                      "Section 5.1, Fig. 5", *_names("mixture_wep", "example_igs_1000", "example_em_5000"))  # fmt: skip
     for key, methods in QUICKEST_FIRST.items():
         yield Claim.order(
             f"time of {'exact' if key == 'mixture_exact' else 'WEP'} fusion, from the least: {', '.join(methods)}",

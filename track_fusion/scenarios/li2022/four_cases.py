@@ -217,29 +217,17 @@ def _claims() -> tuple[Claim, ...]:
         for case, count, words in (("a", 1, "one mode"), ("c", 2, "two modes"), ("d", 2, "two modes"))
     ]  # fmt: skip
     return (
-        _in_every_case(
-            "chain (13), naive < min P <= CU min <= AA <= CU max",
-            "II-E, Fig. 1",
-            (naive, *TRACKS, lower, average, upper),
-            _chain_13,
-        ),
-        _in_every_case(
-            "chain (19), naive < ICI < CI <= AA", "II-E, Fig. 1", (naive, inverse, intersection, average),
-            lambda naive, inverse, intersection, average: [
-                *ascending(naive, inverse, intersection), *_no_falls(intersection, average)
-            ],
-        ),
+        _in_every_case("chain (13), naive < min P <= CU min <= AA <= CU max", "II-E, Fig. 1",
+                       (naive, *TRACKS, lower, average, upper), _chain_13),
+        _in_every_case("chain (19), naive < ICI < CI <= AA", "II-E, Fig. 1", (naive, inverse, intersection, average),
+                       lambda naive, ici, ci, aa: [*ascending(naive, ici, ci), *_no_falls(ci, aa)]),
         _in_every_case("chain (19), CI <= FFCC", "II-C, (19)", (intersection, tolerant), _no_falls),
-        _in_every_case(
-            "every conservative scheme inflates the covariance of naive fusion", "II-E, Fig. 1",
-            (naive, geometric, intersection, average, lower, upper),
-            lambda naive, *traces: [trace - naive for trace in traces],
-        ),
-        _in_every_case(
-            "AA and CU inflate more than GA and CI", "II-E, Fig. 1",
-            (geometric, intersection, average, lower, upper),
-            lambda *traces: [more - less for less in traces[:2] for more in traces[2:]],
-        ),
+        _in_every_case("every conservative scheme inflates the covariance of naive fusion", "II-E, Fig. 1",
+                       (naive, geometric, intersection, average, lower, upper),
+                       lambda naive, *traces: [trace - naive for trace in traces]),
+        _in_every_case("AA and CU inflate more than GA and CI", "II-E, Fig. 1",
+                       (geometric, intersection, average, lower, upper),
+                       lambda *traces: [more - less for less in traces[:2] for more in traces[2:]]),
         *apart,
         *shapes,
     )  # fmt: skip

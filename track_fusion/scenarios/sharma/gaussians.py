@@ -167,24 +167,16 @@ SCENARIO = Scenario(
     figures=figures,
     charts=charts,
     claims=(
-        _order(
-            "The covariance shrinks from GMD-S to HMD-S to HMD-GA.", "5.2, Fig. 1a",
-            "harmonic_mean", "harmonic_mean@sampled", "geometric_mean_sampling",
-        ),
+        _order("The covariance shrinks from GMD-S to HMD-S to HMD-GA.", "5.2, Fig. 1a",
+               "harmonic_mean", "harmonic_mean@sampled", "geometric_mean_sampling"),
         Claim.least("HMD-GA claims less than ICI, HMD-S and CI at the same weights.", "6, Fig. 1a, A",
                     f"given-{HMD_GA.name}/determinant_1", [f"given-{c.name}/determinant_1" for c in (ICI, HMD_S, CI)]),
-        _order(
-            "HMD-GA is tighter than ICI when each finds its own weights: (75)-(76).", "7",
-            "harmonic_mean@own_weights", "inverse_covariance_intersection@own_weights",
-        ),
-        _order(
-            "HMD-GA is always tighter than ICI: the same covariances, means in one place, own weights.", "7",
-            "harmonic_mean@own_weights_same_mean", "inverse_covariance_intersection@own_weights_same_mean",
-        ),
-        _order(
-            f"Inflation by {SMALL_ALPHA:g} makes HMD-S wider than GMD.", "5.2, Fig. 1b",
-            "harmonic_mean@sampled", "covariance_intersection", f"harmonic_mean@sampled_{_label(SMALL_ALPHA)}",
-        ),
+        _order("HMD-GA is tighter than ICI when each finds its own weights: (75)-(76).", "7",
+               "harmonic_mean@own_weights", "inverse_covariance_intersection@own_weights"),
+        _order("HMD-GA is always tighter than ICI: the same covariances, means in one place, own weights.", "7",
+               "harmonic_mean@own_weights_same_mean", "inverse_covariance_intersection@own_weights_same_mean"),
+        _order(f"Inflation by {SMALL_ALPHA:g} makes HMD-S wider than GMD.", "5.2, Fig. 1b",
+               "harmonic_mean@sampled", "covariance_intersection", f"harmonic_mean@sampled_{_label(SMALL_ALPHA)}"),
     ),
     piece=50,
     rules=RULE_CHOICES,

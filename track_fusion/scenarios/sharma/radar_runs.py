@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from track_fusion.centre.centre import FusionCentre
-from track_fusion.centre.config import CentreConfig, FusionCentreParams, SourceConfig, TrackManagerParams
+from track_fusion.centre.config import (
+    CentreConfig,
+    FusionCentreParams,
+    IdentityParams,
+    SourceConfig,
+    TrackManagerParams,
+)
 from track_fusion.linalg import Array
 from track_fusion.metrics.pairing import paired
 from track_fusion.models.geodetic import LocalFrame
@@ -74,6 +80,7 @@ TRACKER = PdaTrackerParams(
     deletion_existence=0.001,
 )
 MANAGER = TrackManagerParams(confirmation_threshold=(2, 3), deletion_threshold=(2, 2), max_coast_s=25.0)
+IDENTITY = IdentityParams("sharma-radars")
 RULE_CHOICES = (
     RuleChoice.of("covariance_intersection"),
     RuleChoice.of("inverse_covariance_intersection"),
@@ -142,7 +149,8 @@ def centre(choice: RuleChoice) -> FusionCentre:
     """Return the fusion centre, with memory, that fuses by this rule."""
     sources = tuple(map(SourceConfig, RADARS))
     rule, params = RULES[choice.key], FusionCentreParams(memory=True)
-    return FusionCentre(CentreConfig(sources, MOTION, FRAME, rule, choice.params, params, MANAGER))
+    config = CentreConfig(sources, MOTION, FRAME, rule, choice.params, params, MANAGER, identity=IDENTITY)
+    return FusionCentre(config)
 
 
 #: What is kept of each target at a fusion, NaN where it is lost, and of the fusion.

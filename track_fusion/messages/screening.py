@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +10,9 @@ from numpy.typing import NDArray
 from msg_adapters.arrays import DetectionArrays, MessageError, TrackArrays
 from track_fusion.angles import KNOWN_PERIODS, named_period, periods_of
 from track_fusion.linalg import Array, is_positive_definite, symmetrise
+from track_fusion.messages.counts import Rejects
 from track_fusion.params import ParameterError, Params, param
 from track_fusion.tracks import ABSURD, SECOND_NS, StateLayout, TrackBatch
-
-if TYPE_CHECKING:
-    from track_fusion.nodes.managed import ManagedNode
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +55,7 @@ class FrameParams(Params):
         return round(self.max_future_s * SECOND_NS)
 
 
-def screened_tracks(node: ManagedNode, arrays: TrackArrays, layout: StateLayout) -> TrackBatch:
+def screened_tracks(counts: Rejects, arrays: TrackArrays, layout: StateLayout) -> TrackBatch:
     """Turn decoded arrays into a checked batch in the node's layout; bad tracks are left out and counted.
 
     Raises
@@ -71,24 +68,24 @@ def screened_tracks(node: ManagedNode, arrays: TrackArrays, layout: StateLayout)
     batch, rejected = TrackBatch.screened(layout=StateLayout(arrays.axes), **arrays.columns)
     if rejected:
         ids = sorted(set(arrays.track_id.tolist()) - set(batch.track_id.tolist()))[:5]
-        node.reject(rejected, f"in a scan of {len(arrays.track_id)} tracks, track {', '.join(map(str, ids))}")
+        counts.reject(rejected, f"in a scan of {len(arrays.track_id)} tracks, track {', '.join(map(str, ids))}")
     try:
         return batch.to_axes(layout)
     except ValueError as error:
         raise MessageError("missing_axis", str(error)) from None
 
 
-def screened_detections(node: ManagedNode, scan: DetectionArrays) -> tuple[Array, Array | None]:
+def screened_detections(counts: Rejects, scan: DetectionArrays) -> tuple[Array, Array | None]:
     """Return the usable detections, (D, m) and (D, m, m) or None; bad ones are left out and counted by reason."""
     good, cov = np.ones(len(scan.value), bool), scan.cov
     for reason, bad in _bad_detections(scan).items():
-        node.reject({reason: int((bad & good).sum())})
+        counts.reject({reason: int((bad & good).sum())})
         good &= ~bad
     if cov is None:
         return scan.value[good], None
     value, cov = scan.value[good], symmetrise(cov[good])
     definite = is_positive_definite(cov)
-    node.reject({"not_positive_definite": int((~definite).sum())})
+    counts.reject({"not_positive_definite": int((~definite).sum())})
     return value[definite], cov[definite]
 
 

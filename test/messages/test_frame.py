@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from track_fusion.angles import HALF_TURN, TURN
-from track_fusion.nodes.screening import FrameParams
+from track_fusion.messages.screening import FrameParams
 from track_fusion.params import ParameterError
 
 
