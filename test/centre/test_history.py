@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from track_fusion.centre.centre import FusionCentre
 from track_fusion.centre.config import (
     CentreConfig,
     FusionCentreParams,
@@ -379,3 +380,83 @@ def test_a_rewind_changes_nothing_it_is_given_and_is_the_same_from_a_pickle():
     again, _ = rewind(reader.config, pickle.loads(pickle.dumps(before)), late)
     assert content(again.present) == content(after.present)
     assert not after.present.ids.flags.writeable
+
+
+# ---- as an object ----------------------------------------------------------------------------------------------------
+
+
+def run(centre, arrivals):
+    """Feed (now, source, scan) in the order of arrival; return what was published."""
+    published = []
+    for now_ns, late in arrivals:
+        assert centre.receive(late.source, late.scan, late.stamp_ns, now_ns) is None
+        published += centre.advance(now_ns)
+    return published
+
+
+def one_source_always_late(tenths, lag):
+    """The first source at once, the second `lag` tenths of a second after its stamp."""
+    arrivals = []
+    for k in range(1, tenths + 1):
+        arrivals.append((k * 100 * MS, at(k, 0.0, 100.0)))
+        if k > lag:
+            arrivals.append((k * 100 * MS + MS, at(k - lag, 0.1, 100.1, source=1)))
+    return arrivals
+
+
+@pytest.mark.parametrize("trigger", ["any_source", "all_sources", "rate"])
+def test_a_source_that_is_always_late_counts_as_if_it_were_not(trigger):
+    """Stamps strictly increase, names stay, and the end is that of the scans in their order."""
+    buffer = {"trigger": trigger, "fusion_timeout_s": 0.0, "gather_window_s": 0.0, "output_rate_hz": 10.0}
+    own = config(sources=2, **buffer)
+    arrivals = one_source_always_late(30, 3)
+    centre = FusionCentre(own, lambda: 0.0)
+    published = run(centre, arrivals)
+    times = [p.time_ns for p in published]
+    assert times == sorted(set(times))
+    assert {tuple(p.tracks.track_id.tolist()) for p in published[1:]} == {(1, 2)}
+    assert sum(p.beyond_share for p in published) == 0
+    assert all(not p.kept_out for p in published)
+    assert sum(p.rewound is not None for p in published) >= 25
+    waiting = [w.stamp_ns for w in centre.buffer.queues[1].waiting]
+    taken = [late for _, late in arrivals if late.source == 0 or late.stamp_ns not in waiting]
+    reference = CentreState.initial(own)
+    for kept in centre.history.kept:
+        new = {s.source: s.scan for s in taken if s.stamp_ns == kept.time_ns}
+        assert sorted(new) == sorted(kept.scans)
+        reference, *_ = step(own, reference, kept.time_ns, new)
+    assert content(centre.state) == content(reference)
+
+
+def test_late_scans_are_taken_up_when_no_other_scan_comes():
+    centre = FusionCentre(config(sources=2, fusion_timeout_s=0.1), lambda: 0.0)
+    run(centre, [(k * 100 * MS, at(k, 0.0)) for k in (1, 2, 3)])
+    assert run(centre, [(301 * MS, at(2, 0.1, source=1))]) == []  # the stamp of the last step is not published twice
+    (taken,) = centre.advance(420 * MS)
+    assert taken.rewound.repeated == 2
+    assert taken.time_ns == 300 * MS + 1
+    assert taken.tracks.track_id.tolist() == [1]
+
+
+def test_a_piece_of_a_scan_that_was_taken_joins_it():
+    own = config(sources=2, assembly_window_s=0.0, fusion_timeout_s=0.1, gather_window_s=0.0)
+    own = dataclasses.replace(own, sources=(SourceConfig("whole"), SourceConfig("pieces", assembles=True)))
+    centre = FusionCentre(own, lambda: 0.0)
+    first, second = at(2, 0.0, source=1, ids=[0]), at(2, 100.0, source=1, ids=[1])
+    run(centre, [(100 * MS, at(1, 0.0, 100.0)), (200 * MS, first), (250 * MS, second), (300 * MS, at(3, 0.0, 100.0))])
+    list(centre.advance(301 * MS))
+    (kept,) = [kept for kept in centre.history.kept if kept.time_ns == 200 * MS]
+    assert kept.scans[1].scan.track_id.tolist() == [0, 1]
+
+
+def test_identifiers_go_on_counting_after_a_reset():
+    centre = FusionCentre(config(sources=2, gather_window_s=0.0), lambda: 0.0)
+    run(
+        centre,
+        [(100 * MS, at(1, 0.0)), (300 * MS, at(3, 0.0)), (310 * MS, at(2, 500.0, source=1)), (400 * MS, at(4, 0.0))],
+    )
+    assert centre.tracks.track_id.tolist() == [1, 2]
+    centre.reset()
+    (again,) = run(centre, [(500 * MS, at(5, 0.0))])
+    assert again.tracks.track_id.tolist() == [3]
+    assert centre.history.kept[0].before.state.time_ns == -1

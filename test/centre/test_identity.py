@@ -56,7 +56,9 @@ DRAWS = 10
 @pytest.mark.parametrize("name", table())
 def test_a_row_of_the_table_is_as_wanted(name):
     row = table()[name]
-    results = [score(row.make(np.random.default_rng(draw), False), **row.params) for draw in range(min(row.draws, DRAWS))]
+    results = [
+        score(row.make(np.random.default_rng(draw), False), **row.params) for draw in range(min(row.draws, DRAWS))
+    ]
     targets = int(results[0].living[0])
     if row.draws > 1:
         assert np.mean([identity.is_right(result, targets) for result in results]) >= 0.99

@@ -148,21 +148,22 @@ def _refusal(params: ScanBufferParams, buffer: ScanBuffer, queue: Queue, stamp_n
 
 
 def _taken_in(config: CentreConfig, source: int, queue: Queue, new: Waiting) -> tuple[Queue, str | None]:
-    """Sort a scan in, or put a piece to the scan whose stamp it bears; retrodiction puts it to one that was fused."""
+    """Sort a scan in, or put a piece to the scan whose stamp it bears."""
     assembles = config.sources[source].assembles
     ids = frozenset(new.scan.track_id.tolist()) if assembles else frozenset[int]()
     newest = queue.stamps[-1] if queue.stamps else -1
     if new.stamp_ns == newest:
         queue = dataclasses.replace(queue, ids=queue.ids | ids)
     same = next((w for w in queue.waiting if w.stamp_ns == new.stamp_ns), None)
-    if same is None and new.stamp_ns == queue.taken_ns and not (assembles and config.retrodicts):
+    joins_what_was_taken = assembles and config.retrodicts
+    if same is None and new.stamp_ns == queue.taken_ns and not joins_what_was_taken:
         return queue, "late_scan" if assembles else "duplicate_scan"
     if same is not None and not assembles:
         return queue, "duplicate_scan"
     if same is not None:
         return _joined(queue, same, new)
     waiting = sorted((*queue.waiting, new._replace(scan=new.scan.owned())), key=lambda w: w.stamp_ns)
-    stamps = tuple(sorted({*queue.stamps, new.stamp_ns})[-STAMPS_KEPT:])
+    stamps = tuple(sorted((*queue.stamps, new.stamp_ns))[-STAMPS_KEPT:])
     queue = dataclasses.replace(queue, waiting=tuple(waiting), stamps=stamps)
     return dataclasses.replace(queue, ids=ids, expected=queue.ids) if new.stamp_ns > newest else queue, None
 

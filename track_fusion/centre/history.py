@@ -205,8 +205,9 @@ def _stepped(
 
 
 def _exchanged(words: Ids, meanings: Ids, ids: Ids) -> Ids:
-    """Exchange identifiers, each one of the words, which ascend, for their meanings."""
-    meant = np.asarray(meanings[np.searchsorted(words, ids)])
+    """Exchange identifiers, each one of the words, for their meanings."""
+    order = np.argsort(words, kind="stable")
+    meant = np.asarray(meanings[order[np.searchsorted(words, ids, sorter=order)]])
     meant.setflags(write=False)
     return meant
 
