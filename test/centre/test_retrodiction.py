@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Callable
 from typing import Any
@@ -84,6 +85,38 @@ def test_a_late_source_leaves_the_state_that_a_prompt_one_would(delay_ns):
     assert {i for result in published for i in result.tracks.track_id.tolist()} == {1, 2}
     assert len({bytes(u) for result in published for u in result.tracks.uuid}) == 2
     assert not any(result.kept_out for result in published)
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 7.0])
+def test_at_a_fixed_rate_a_late_scan_joins_the_step_that_it_would_have(rate_hz):
+    """Ticks are no stamps: of two scans of a source in one tick the newer counts, whenever it came."""
+    late, prompt = (unlimited(trigger="rate", output_rate_hz=rate_hz) for _ in range(2))
+    published = driven(late, DELAY_NS), driven(prompt, 2 * MS)
+    ticks = [{result.time_ns % round(SECOND / rate_hz) for result in results} for results in published]
+    assert ticks == [{0}, {0}]
+    for name in ("mean", "cov", "time_ns", "track_id"):
+        np.testing.assert_array_equal(getattr(late.tracks, name), getattr(prompt.tracks, name))
+    kept = [[(step.time_ns, sorted(step.scans)) for step in own.history.kept] for own in (late, prompt)]
+    assert kept[0] == kept[1]
+
+
+def test_a_piece_that_comes_after_its_scan_was_fused_joins_it():
+    own = unlimited(assembly_window_s=0.0, gather_window_s=0.0)
+    sources = SourceConfig("whole"), SourceConfig("pieces", assembles=True)
+    own = FusionCentre(dataclasses.replace(own.config, sources=sources), lambda: 0.0)
+    arrivals = [
+        (0, scan(0, 0), 0),
+        (1, scan(1, 1)[:1], 1),
+        (0, scan(0, 2), 2),
+        (1, scan(1, 1)[1:], 1),
+        (0, scan(0, 3), 3),
+    ]
+    for k, (source, tracks, stamp) in enumerate(arrivals):
+        now_ns = SECOND + 100 * k * MS
+        assert own.receive(source, tracks, SECOND + 100 * stamp * MS, now_ns) is None
+        list(own.advance(now_ns))
+    whole = next(step for step in own.history.kept if step.time_ns == SECOND + 100 * MS)
+    assert whole.scans[1].scan.track_id.tolist() == [4, 7]
 
 
 def test_predicting_the_same_late_scans_gives_another_state():
