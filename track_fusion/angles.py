@@ -9,7 +9,7 @@ back onto the reference. So turning everything by an angle turns the result by t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -64,7 +64,7 @@ def named_period(spelt: str) -> tuple[str, float]:
 
 def wraps(periods: Any) -> bool:
     """Tell whether any axis wraps; quickly, since most states have none that does."""
-    return any(map(math.isfinite, periods)) if isinstance(periods, Iterable) else math.isfinite(periods)
+    return math.isfinite(periods) if isinstance(periods, (float, int)) else any(map(math.isfinite, periods))
 
 
 def wrap(values: ArrayLike, periods: ArrayLike) -> Array:

@@ -53,16 +53,17 @@ def associate(config: CentreConfig, pool: Pool, links: Links, fresh: Bools) -> A
     births = _start(config, pool, target, held, fresh)
     row = np.where(target >= 0, target, np.where(held, linked, -1))
     after = links.after(pool.key, row, idle, fresh, config.params.patience, _shares(config))
-    own = _taken(config, pool, target, births, after)
-    return dataclasses.replace(own, held=int(np.count_nonzero(held & fresh[pool.source])), released=released)
+    return _taken(config, pool, target, births, after, int(np.count_nonzero(held & fresh[pool.source])), released)
 
 
-def _taken(config: CentreConfig, pool: Pool, target: Rows, births: int, links: Links) -> Association:
+def _taken(
+    config: CentreConfig, pool: Pool, target: Rows, births: int, links: Links, held: int = 0, released: int = 0
+) -> Association:
     """Sum up the target of each source track, (P,), -1 = none."""
     member = np.flatnonzero(target >= 0)
     target = target[member]
     old = target[target < len(pool.tracks) - len(pool.source)] if config.params.memory else target[:0]
-    return Association(member, target, births, np.unique(old), links)
+    return Association(member, target, births, np.unique(old), links, held, released)
 
 
 def _shares(config: CentreConfig) -> bool:
@@ -99,7 +100,7 @@ def _assigned(config: CentreConfig, pool: Pool, near: Candidates) -> Rows:
     """Give the old central track of each source track, (P,), -1 = none: one to one within each source."""
     sources, count = len(pool.source), len(pool.tracks) - len(pool.source)
     # All sources at once: to each its own copy of the central tracks.
-    own = dataclasses.replace(near, col=near.col + count * pool.source[near.row])
+    own = Candidates(near.row, near.col + count * pool.source[near.row], near.distance, near.logdet)
     target = assign(own, sources, count * len(config.sources), config.gamma)
     target[target >= 0] %= count
     return target
@@ -124,9 +125,11 @@ def _held(
 
 def _start(config: CentreConfig, pool: Pool, target: Rows, held: Bools, fresh: Bools) -> int:
     """Start tracks from what is left of new scans: write them into `target`, and return how many."""
+    leftover = np.flatnonzero((target < 0) & ~held & fresh[pool.source])
+    if not len(leftover):
+        return 0
     mean, cov, central, _ = pool.split()
     starters = np.zeros(0, np.intp)  # the track that started each group
-    leftover = np.flatnonzero((target < 0) & ~held & fresh[pool.source])
     for k in np.unique(pool.source[leftover]):
         left = leftover[pool.source[leftover] == k]
         group = nearest_neighbour(
