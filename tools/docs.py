@@ -58,10 +58,12 @@ def docs(ctx: click.Context, check: bool, picture: bool, root: Path) -> None:
     if not (root / "package.xml").is_file():
         raise click.UsageError(f"--root: {root} is no source tree of track_fusion, it has no package.xml.")
     if picture:
-        from tools.gallery import draw_rules
+        from tools.gallery import draw_ghosts, draw_rules
 
         (root / "doc").mkdir(exist_ok=True)
         click.echo(f"Drew {len(draw_rules(root / 'doc' / 'rules.png'))} rules in doc/rules.png")
+        draw_ghosts(root / "doc" / "ghosts.png")
+        click.echo("Drew doc/ghosts.png")
     differing = []
     for name, text in generated().items():
         path = root / name

@@ -1,4 +1,4 @@
-"""One picture of all rules on the same two tracks, at the four separations of Fig. 1 of Li 2022."""
+"""Pictures for the pages: all rules on the same two tracks, as in Fig. 1 of Li 2022; ghosts with and without links."""
 
 from __future__ import annotations
 
@@ -39,6 +39,39 @@ def draw_rules(path: Path) -> list[str]:
     figure.savefig(path, dpi=100)
     plt.close(figure)
     return [rule.key for rule in rules]
+
+
+def draw_ghosts(path: Path) -> None:
+    """Draw how many tracks too many a centre publishes over time, with one gate of 99 % and with its defaults.
+
+    Twenty targets 3 m apart, two consistent Kalman trackers, one colour a standard deviation of the second one's
+    measurements.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import numpy as np
+    from matplotlib import pyplot as plt
+
+    from benchmark.identity import PERIOD_S, score, side_by_side, single_gate
+
+    centres = {"one gate of 99 %": single_gate(0.99), "links, patience, duplicates (the defaults)": {}}
+    figure, panels = plt.subplots(1, len(centres), figsize=(11, 3.2), sharey=True, constrained_layout=True)
+    for sd, color in zip((1.0, 2.0, 4.0, 8.0), COLORS, strict=False):
+        scene = side_by_side(np.random.default_rng(0), False, (1.0, sd), spacing_m=3.0, seconds=60.0)
+        for axes, (name, params) in zip(panels, centres.items(), strict=True):
+            result = score(scene, **params)
+            time_s = PERIOD_S * np.arange(len(result.published))
+            extra = np.maximum(result.published - result.living, 0)
+            axes.step(time_s, extra, color=color, lw=1.0, label=f"sd 1 and {sd:g} m: {result.ghosts:.0%} of steps")
+            axes.set_title(name)
+            axes.set_xlabel("time [s]")
+    panels[0].set_ylabel("tracks too many")
+    for axes in panels:
+        axes.set_ylim(-0.1, 4.5)  # room for the legend
+        axes.legend(fontsize=8, loc="upper right")
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
 
 
 def _panel(axes: Any, group: Sequence[Rule], separation: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from cli.runner import refusal, run
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from msg_adapters.track_table import track_table_from_msg, track_table_to_msg
-from track_fusion.bags.fuse import FUSED, TABLE
+from track_fusion.bags.fuse import FUSED, TABLE, centre_of
 from track_fusion.bags.read import deserialised, read_bag
 from track_fusion.bags.write import add_topic, bag_class, serialised
 from track_fusion.tracks import TrackBatch, planar_layout
@@ -179,3 +180,15 @@ def test_a_message_written_without_ros_is_read_as_it_was() -> None:
         back = track_table_from_msg(deserialised(data, TABLE))
         for name, value in back.columns.items():
             np.testing.assert_array_equal(value, getattr(tracks, name))
+
+
+def test_the_first_robot_of_the_page_is_a_centre(tmp_path: Path) -> None:
+    page = (ROOT / "doc" / "fusion-centre.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    assert len(block.splitlines()) == 10
+    (tmp_path / "robot.yaml").write_text(block)
+    centre = centre_of(tmp_path / "robot.yaml", print)
+    assert [(s.name, s.topic, s.kind.whole_scan) for s in centre.sources] == [
+        ("radar", "/radar/tracks", True), ("camera", "/camera/odometry", False),
+    ]  # fmt: skip
+    assert centre.centre.config.sources[1].settings.bias_sd == 0.3
