@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from benchmark import scenes
 from benchmark.measure import Result
@@ -16,10 +15,11 @@ from benchmark.scenes import Scene, tracked, two_trackers
 from track_fusion.centre.centre import FusionCentre
 from track_fusion.centre.config import CentreConfig, FusionCentreParams, SourceConfig
 from track_fusion.linalg import Array
+from track_fusion.metrics.gospa import SetDistanceParams, set_distance
 from track_fusion.rules import RULES
 
-#: GOSPA: who is farther than this from a target, in metres, does not track it; errors count squared.
-CUT_OFF_M = 6.0
+#: Who is farther than this from a target does not track it; errors count squared.
+GOSPA = SetDistanceParams(cutoff_m=6.0, order=2.0)
 PERIOD_S = 0.1
 
 
@@ -76,13 +76,9 @@ def score(scene: Scene, **params: Any) -> Score:
 
 
 def judged(tracks: Array, truth: Array) -> tuple[dict[int, int], float]:
-    """Pair tracks with targets, positions (N, 2) and (L, 2): pairs, and GOSPA (p = alpha = 2)."""
-    squared = np.minimum(((tracks[:, None] - truth) ** 2).sum(-1), CUT_OFF_M**2)
-    row, col = linear_sum_assignment(squared)
-    near = squared[row, col] < CUT_OFF_M**2
-    alone = len(tracks) + len(truth) - 2 * near.sum()
-    pairs = dict(zip(row[near].tolist(), col[near].tolist(), strict=True))
-    return pairs, float(np.sqrt(squared[row, col][near].sum() + alone * CUT_OFF_M**2 / 2))
+    """Pair tracks with targets, positions (N, 2) and (L, 2): pairs, and GOSPA."""
+    result = set_distance(truth, tracks, GOSPA)
+    return dict(zip(result.track.tolist(), result.target.tolist(), strict=True)), result.gospa
 
 
 class Row(NamedTuple):

@@ -436,27 +436,3 @@ def test_late_scans_are_taken_up_when_no_other_scan_comes():
     assert taken.rewound.repeated == 2
     assert taken.time_ns == 300 * MS + 1
     assert taken.tracks.track_id.tolist() == [1]
-
-
-def test_a_piece_of_a_scan_that_was_taken_joins_it():
-    own = config(sources=2, assembly_window_s=0.0, fusion_timeout_s=0.1, gather_window_s=0.0)
-    own = dataclasses.replace(own, sources=(SourceConfig("whole"), SourceConfig("pieces", assembles=True)))
-    centre = FusionCentre(own, lambda: 0.0)
-    first, second = at(2, 0.0, source=1, ids=[0]), at(2, 100.0, source=1, ids=[1])
-    run(centre, [(100 * MS, at(1, 0.0, 100.0)), (200 * MS, first), (250 * MS, second), (300 * MS, at(3, 0.0, 100.0))])
-    list(centre.advance(301 * MS))
-    (kept,) = [kept for kept in centre.history.kept if kept.time_ns == 200 * MS]
-    assert kept.scans[1].scan.track_id.tolist() == [0, 1]
-
-
-def test_identifiers_go_on_counting_after_a_reset():
-    centre = FusionCentre(config(sources=2, gather_window_s=0.0), lambda: 0.0)
-    run(
-        centre,
-        [(100 * MS, at(1, 0.0)), (300 * MS, at(3, 0.0)), (310 * MS, at(2, 500.0, source=1)), (400 * MS, at(4, 0.0))],
-    )
-    assert centre.tracks.track_id.tolist() == [1, 2]
-    centre.reset()
-    (again,) = run(centre, [(500 * MS, at(5, 0.0))])
-    assert again.tracks.track_id.tolist() == [3]
-    assert centre.history.kept[0].before.state.time_ns == -1

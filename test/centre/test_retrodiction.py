@@ -156,3 +156,4 @@ def test_a_reset_goes_on_with_names_that_nobody_had():
     own.reset()
     own.step(SECOND, {0: scan(0, 0)})
     assert own.tracks.track_id.tolist() == [given, given + 1]
+    assert own.history.kept[0].before.state.time_ns == -1

@@ -33,10 +33,6 @@ from sensor_msgs.msg import PointCloud2
 
 from msg_adapters.odometry import odometry_to_msgs
 from msg_adapters.track_table import track_table_to_msg
-from track_fusion.centre.centre import FusionCentre
-from track_fusion.centre.config import CentreConfig, FusionCentreParams, SourceConfig, TrackManagerParams
-from track_fusion.models.motion import MotionParams, NearlyConstantVelocity
-from track_fusion.rules import RULES
 from track_fusion.tracks import TrackBatch, planar_layout
 
 # ---- start and end -----------------------------------------------------------------------------------------------
@@ -133,10 +129,6 @@ class Set:
         assert self.probe.call(f"/{node}/change_state", ChangeState, request, START_S).success
 
 
-#: A step at 10.1 s is repeated after one at 10.05 s.
-RETRODICTING = {"out_of_sequence": "retrodict", "memory": True, "max_rewind_share": 1.0, "state_fusion": "naive"}
-
-
 @pytest.fixture(scope="module")
 def nodes(shared_domain: int, shared_probe: Probe, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Set]:
     one = PATIENT | {"confirmation_threshold": [1, 1], "source_configurations": ["a"]}
@@ -148,7 +140,6 @@ def nodes(shared_domain: int, shared_probe: Probe, tmp_path_factory: pytest.Temp
         ("fusion_centre", "managed", one | {"use_sim_time": False, "autostart": False, "max_delay_s": 1e10}),
         ("fusion_centre", "neglecting", two | {"out_of_sequence": "neglect"}),
         ("fusion_centre", "predicting", two | {"out_of_sequence": "predict", "fusion_timeout_s": 0.0}),
-        ("fusion_centre", "retrodicting", two | RETRODICTING),
         ("fusion_centre", "jumping_centre", one),
         ("sensor_tracker", "jumping_tracker", tracker),
         ("evaluator", "judge", {"output": str(folder / "judge.json")}),
@@ -232,43 +223,6 @@ def test_late_scans_are_neglected_or_predicted(nodes: Set) -> None:
         nodes.await_count(fused, 2 + (name == "predicting"), "the last step", **time)
         assert stamp_ns(fused[-1]) == 101 * SECOND_NS // 10
         assert nodes.diagnostics.rejected(name) == ({} if name == "predicting" else {"late_scan": 1})
-
-
-def test_a_late_scan_is_put_where_it_belongs(nodes: Set) -> None:
-    """The centre hears a at 10.0, 10.1 s, then b of 10.05 s, then a at 10.2 s: the last is as if b had come in time."""
-    scans = {
-        (source, at): track_table(at * SECOND_NS // 100, [at * 0.01, 0.5 * (source == "b"), 1.0, 0.0])
-        for source, at in (("a", 1000), ("a", 1010), ("b", 1005), ("a", 1020))
-    }
-    fused = nodes.probe.listen("/retrodicting/tracks", PointCloud2)
-    time = {"ticker": nodes.publisher("/retrodicting/clock", Clock), "now_ns": 102 * SECOND_NS // 10}
-    a, b = (nodes.publisher(f"/retrodicting/sources/{s}/tracks", PointCloud2) for s in "ab")
-    for count, at in ((1, 1000), (2, 1010)):
-        a.publish(scans["a", at])
-        nodes.await_count(fused, count, f"the step at {at / 100} s", **time)
-    b.publish(scans["b", 1005])
-    assert b.wait_for_all_acked()
-    for _ in range(2):  # the second answer comes after all that was there before the first
-        nodes.probe.state("/retrodicting")
-    a.publish(scans["a", 1020])
-    nodes.await_count(fused, 3, "the last step", **time)
-    assert [stamp_ns(m) * 100 // SECOND_NS for m in fused] == [1000, 1010, 1020]
-    assert [read(m).track_id.tolist() for m in fused] == [[1], [1], [1]]
-    rule, motion = RULES["naive"], NearlyConstantVelocity(planar_layout(), MotionParams())
-    sources = SourceConfig("a"), SourceConfig("b")
-    own = FusionCentre(
-        CentreConfig(sources, motion, "map", rule, rule.params(), FusionCentreParams(memory=True),
-                     TrackManagerParams(confirmation_threshold=(1, 1)))
-    )  # fmt: skip
-    for source, at in sorted(scans, key=lambda key: key[1]):
-        arrays, time_ns = read(scans[source, at]), at * SECOND_NS // 100
-        scan = TrackBatch.gaussian(planar_layout(), "map", arrays.mean[:, 0], arrays.cov[:, 0], time_ns=time_ns)
-        expected, _ = own.step(time_ns, {"ab".index(source): scan})
-    np.testing.assert_allclose(read(fused[-1]).mean, expected.mean, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(read(fused[-1]).cov, expected.cov, rtol=0, atol=1e-9)
-    wanted = {"rewinds": "1", "repeated_steps": "2"}
-    nodes.diagnostics.wait_for("retrodicting", lambda v: wanted.items() <= v.items(), f"the counts {wanted}")
-    assert nodes.diagnostics.rejected("retrodicting") == {}
 
 
 def test_a_clock_that_jumps_back_starts_the_centre_anew(nodes: Set) -> None:

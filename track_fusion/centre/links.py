@@ -64,7 +64,7 @@ class Links:
         key, row, idle : (P,)    of the source tracks that were associated, row -1 = without link
         fresh : (S,)             which sources delivered a new scan
         patience : int           idle updates that a link outlives
-        shared : bool            whether several tracks of one source may be linked to one central track
+        shared : bool            whether an absent track keeps its link beside others of its source
         """
         at = np.flatnonzero(row >= 0)
         new = Links(key[at], row[at], idle[at])

@@ -44,7 +44,7 @@ class SourceParams(Params):
     """Where source tracks come from."""
 
     source_configurations: tuple[str, ...] = param(
-        ("sensor_1", "sensor_2"), "name of each source; its tracks are read from ~/sources/<name>/tracks"
+        ("sensor_1", "sensor_2"), "name of each source; parameters of its own begin with it"
     )
     source_types: tuple[str, ...] = param(
         (),
